@@ -3,7 +3,7 @@ units of that of ``path``, and for each event in units of a ray.
 
     python benchmarks/decision_costs.py scenes/rooms.xml …
 
-The constants of guided directions in ``mitsuba_ext/learning/benefit.py`` are medians of what this
+The constants of guided directions in ``mitsuba_ext/planning/benefit.py`` are medians of what this
 prints.
 """
 
@@ -18,7 +18,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.learning.next_event import light_map_learner  # isort: skip
+from mitsuba_ext.techniques.learned_lights import learner as light_map_learner  # isort: skip
 
 #: Both learned decisions are kept, whatever they are worth.
 _GUIDED = {"type": "guided_directions", "always_guide": True}

@@ -23,7 +23,7 @@ import numpy as np
 from equal_samples import load, print_header, print_row
 from scipy.ndimage import gaussian_filter
 
-from mitsuba_ext.defocus.filters import FILTERS
+from mitsuba_ext.estimators.defocus.filters import FILTERS
 from mitsuba_ext.images.flip import mean_flip
 
 import drjit as dr  # isort: skip

@@ -21,9 +21,9 @@ from defocus import reference_of, scene_of, ssim, timed
 from equal_samples import print_header, print_row
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mitsuba_ext.composition.guides import render_guides
 from mitsuba_ext.images.denoising import denoiser
 from mitsuba_ext.images.flip import mean_flip
+from mitsuba_ext.rendering.scene_guides import render_guides
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

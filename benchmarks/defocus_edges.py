@@ -17,10 +17,10 @@ import math
 import numpy as np
 from equal_samples import print_header, print_row
 
-from mitsuba_ext.defocus.effective import effective_filter
-from mitsuba_ext.defocus.images import Size
-from mitsuba_ext.defocus.layers import LayerSums, layers_from_sums
-from mitsuba_ext.defocus.lens_filter import lens_filter
+from mitsuba_ext.estimators.defocus.effective import effective_filter
+from mitsuba_ext.estimators.defocus.images import Size
+from mitsuba_ext.estimators.defocus.layers import LayerSums, layers_from_sums
+from mitsuba_ext.estimators.defocus.lens_filter import lens_filter
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.defocus.filters import FILTERS, Capture
-from mitsuba_ext.defocus.images import Pyramid, Size, rgb
-from mitsuba_ext.defocus.layers import Limits, layers_from_sums
-from mitsuba_ext.defocus.lens_points import LensPoints, ring_points
+from mitsuba_ext.estimators.defocus.filters import FILTERS, Capture
+from mitsuba_ext.estimators.defocus.images import Pyramid, Size, rgb
+from mitsuba_ext.estimators.defocus.layers import Limits, layers_from_sums
+from mitsuba_ext.estimators.defocus.lens_points import LensPoints, ring_points
 
 #: Points of the spiral of the filter of one pass.
 _SPIRAL = 96

@@ -17,8 +17,8 @@ import defocus_rivals  # noqa: F401  (adds its filters)
 import numpy as np
 from equal_samples import print_header, print_row
 
-from mitsuba_ext.defocus.filters import FILTERS, defocus
-from mitsuba_ext.defocus.thin_lens import ThinLens
+from mitsuba_ext.estimators.defocus.filters import FILTERS, defocus
+from mitsuba_ext.estimators.defocus.thin_lens import ThinLens
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

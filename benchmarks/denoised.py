@@ -20,10 +20,10 @@ from equal_samples import load, title
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.compare.references import Reference, load_reference, render_reference
-from mitsuba_ext.composition.guides import render_guides
 from mitsuba_ext.images.denoising import denoise
 from mitsuba_ext.images.metrics import errors
 from mitsuba_ext.inputs.scenes import load_scene
+from mitsuba_ext.rendering.scene_guides import render_guides
 
 import mitsuba as mi  # isort: skip
 

@@ -40,7 +40,7 @@ from equal_samples import (
 )
 
 import mitsuba_ext  # noqa: F401
-from mitsuba_ext.decisions.next_event.two_stage import TwoStage
+from mitsuba_ext.techniques.two_stage_lights.two_stage import TwoStage
 from mitsuba_ext.transport.mis import power_heuristic
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from mitsuba_ext.learning.pixel_estimates import relative_scale
+from mitsuba_ext.planning.pixel_estimates import relative_scale
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

@@ -25,7 +25,7 @@ from equal_samples import SCENES, TRIMMED, load, print_header, print_row
 from fog_scenes import FOGS
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
-from mitsuba_ext.learning.pixel_estimates import relative_scale
+from mitsuba_ext.planning.pixel_estimates import relative_scale
 
 import mitsuba as mi  # isort: skip
 

@@ -26,10 +26,10 @@ from equal_samples import (
     title,
 )
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
-from mitsuba_ext.bidirectional.sensor import is_occluded
-from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
+from mitsuba_ext.estimators.light_paths.sensor import is_occluded
 from mitsuba_ext.transport.numbers import hashed_2d
 from mitsuba_ext.transport.path_decisions import SceneQuery
 

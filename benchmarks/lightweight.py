@@ -125,8 +125,8 @@ def structures(positions: np.ndarray, faces: np.ndarray, all_of_them: bool) -> d
     """The trees by name: functions that make them."""
     from lightweight_nodes import PRECISIONS
 
-    from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
-    from mitsuba_ext.lightweight.packed_mesh import PackedMesh
+    from mitsuba_ext.scene.lightweight.mesh_geometry import MeshGeometry
+    from mitsuba_ext.scene.lightweight.packed_mesh import PackedMesh
 
     made = {
         "ours": lambda: MeshGeometry(mesh(positions, faces)),

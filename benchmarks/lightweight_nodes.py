@@ -9,11 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.lightweight.heap import ARITY
-from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry, sort_faces
-from mitsuba_ext.lightweight.mesh_tree import Corners, MeshTree, RaysInTree, positions_and_faces
-from mitsuba_ext.lightweight.nodes import RANGE
-from mitsuba_ext.lightweight.traversal import NONE, traverse
+from mitsuba_ext.scene.lightweight.heap import ARITY
+from mitsuba_ext.scene.lightweight.mesh_geometry import MeshGeometry, sort_faces
+from mitsuba_ext.scene.lightweight.mesh_tree import (
+    Corners,
+    MeshTree,
+    RaysInTree,
+    positions_and_faces,
+)
+from mitsuba_ext.scene.lightweight.nodes import RANGE
+from mitsuba_ext.scene.lightweight.traversal import NONE, traverse
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from equal_samples import load, print_header, print_row, title
 
 import mitsuba_ext  # noqa: F401
-from mitsuba_ext.learning.pixel_estimates import relative_scale
+from mitsuba_ext.planning.pixel_estimates import relative_scale
 
 import mitsuba as mi  # isort: skip
 
@@ -50,7 +50,7 @@ def passes(names, counts, seeds, reference, max_depth) -> None:
     """Variance and squared bias after some passes of one sample per pixel, relative as in
     equal_samples.py, and how fast they fall from count to count: the power of the number of passes.
     The reference is ``vcm`` with a radius of four pixels at first."""
-    from mitsuba_ext.bidirectional.merging import median_footprint
+    from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
     from mitsuba_ext.transport.scene_query import SceneQuery
 
     print_header(["scene", "", "passes", "variance", "power", "bias²", "power", "mean"])

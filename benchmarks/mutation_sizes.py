@@ -15,7 +15,7 @@ import numpy as np
 from equal_samples import error, load, options, print_header, print_row, render_in_turns, title
 
 import mitsuba_ext  # noqa: F401
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
 
 import click  # isort: skip
 import mitsuba as mi  # isort: skip

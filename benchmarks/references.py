@@ -21,8 +21,8 @@ from previews import INTEGRATORS, PICTURES, SPECTRAL, WIDTHS
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.compare.references import load_reference, render_reference
-from mitsuba_ext.errors import InputError
 from mitsuba_ext.inputs.scenes import load_scene
+from mitsuba_ext.util.errors import InputError
 
 import mitsuba as mi  # isort: skip
 

@@ -18,8 +18,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.maps.weighted_sets import WEIGHTS
-from mitsuba_ext.pointsets import PATTERNS
+from mitsuba_ext.techniques.weighted_points.weighted_sets import WEIGHTS
+from mitsuba_ext.util.pointsets import PATTERNS
 
 import mitsuba as mi  # isort: skip
 

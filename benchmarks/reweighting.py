@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy import integrate, ndimage
 
-from mitsuba_ext.pointsets import (
+from mitsuba_ext.util.pointsets import (
     nearest_neighbour_weights,
     piecewise_points,
     piecewise_weights,

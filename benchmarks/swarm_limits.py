@@ -72,7 +72,7 @@ def main(
         )
 
     show("learned", swarm())
-    from mitsuba_ext.learning.swarm import map_learner
+    from mitsuba_ext.techniques.swarming import map_learner
 
     for edge in filter(None, edges.split(",")):
         map_learner.tile_edge = lambda *_, edge=int(edge): edge

@@ -3,8 +3,8 @@ and in brackets as the trial of ``auto`` predicts it.
 
     python benchmarks/technique_times.py scenes/corridor.xml scenes/keyhole.xml …
 
-The constants of ``mitsuba_ext/composition/light_paths.py``, and ``SEGMENT`` and ``SHADOW`` of
-``mitsuba_ext/learning/benefit.py``, were fitted to what this prints. The machine must be idle.
+The constants of ``mitsuba_ext/estimators/light_paths/choice/light_paths.py``, and ``SEGMENT`` and
+``SHADOW`` of ``mitsuba_ext/planning/benefit.py``, were fitted to what this prints. The machine must be idle.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.bidirectional.candidates import Candidate  # isort: skip
-from mitsuba_ext.composition.light_paths import LightPathTrial  # isort: skip
+from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate  # isort: skip
+from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathTrial  # isort: skip
 from mitsuba_ext.inputs.scenes import load_scene, scene_name  # isort: skip
 
 #: The sets of techniques; those that merge are measured where the trial can merge.

@@ -5,8 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.materials.dispersive_interface import DispersiveInterface, fresnel_spectrum
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.materials.dispersive_interface import (
+    DispersiveInterface,
+    fresnel_spectrum,
+)
 
 
 @registry.plugin

@@ -5,13 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.materials.dispersive_interface import (
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.materials.dispersive_interface import (
     DispersiveInterface,
     check_uniform,
     fresnel_spectrum,
 )
-from mitsuba_ext.parameters import read_parameter
-from mitsuba_ext.startup import registry
+from mitsuba_ext.util.parameters import read_parameter
 
 NAME = "dispersive_roughdielectric"
 

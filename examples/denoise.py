@@ -8,8 +8,8 @@
 from pathlib import Path
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.composition.guides import render_guides
 from mitsuba_ext.images.denoising import denoise
+from mitsuba_ext.rendering.scene_guides import render_guides
 
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip

@@ -9,11 +9,11 @@
 from __future__ import annotations
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.arrays import from_numpy
-from mitsuba_ext.composition.decision_parameters import DecisionParameters, ParameterReader, Setting
-from mitsuba_ext.composition.decision_plugin import DecisionPlugin
-from mitsuba_ext.decisions.next_event.light_table import LightTable
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.bases.decision_plugin import DecisionPlugin
+from mitsuba_ext.planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.transport.light_table import LightTable
+from mitsuba_ext.util.arrays import from_numpy
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

@@ -19,7 +19,7 @@ import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.composition.pixel_maps import PixelMap, light_probabilities, pixel_maps
+from mitsuba_ext.techniques.swarming.pixel_maps import PixelMap, light_probabilities, pixel_maps
 
 #: Labels of the axes of the plots, by slot, in the order of the columns.
 _LABELS = {

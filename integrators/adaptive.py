@@ -6,11 +6,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.wrapping_integrator import WrappingIntegrator
-from mitsuba_ext.parameters import MOST_SPP
+from mitsuba_ext.bases.wrapping_integrator import WrappingIntegrator
 from mitsuba_ext.rendering.adaptive_job import AdaptiveJob
 from mitsuba_ext.rendering.render import render
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.parameters import MOST_SPP
 
 #: The name of the channel that holds the sample counts.
 _COUNTS = "samples"

@@ -9,19 +9,22 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.candidates import Candidate
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
-from mitsuba_ext.composition import light_path_schedule
-from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
-from mitsuba_ext.composition.learned_slots import learned_slots
-from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
-from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
-from mitsuba_ext.composition.merging_parameters import MergingParameters
-from mitsuba_ext.composition.photon_trial import PhotonChoice, PhotonTrial
-from mitsuba_ext.composition.photons import photon_mapper
-from mitsuba_ext.composition.staged_integrator import NO_LIMIT
-from mitsuba_ext.composition.walk_integrator import LEARNING_KERNELS
+from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.bases.bidirectional_integrator import LightPathIntegrator
+from mitsuba_ext.bases.learned_slots import learned_slots
+from mitsuba_ext.bases.light_path_schedule import LightPathSchedule
+from mitsuba_ext.bases.staged_integrator import NO_LIMIT
+from mitsuba_ext.bases.walk_integrator import LEARNING_KERNELS
+from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
+from mitsuba_ext.estimators.light_paths.choice.light_paths import (
+    LightPathsWhereTheyPay,
+    LightPathTrial,
+)
+from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonChoice, PhotonTrial
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
+from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
+from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.bsdfs import has_clear_curves

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.learned_slots import learned_slots
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.learned_slots import learned_slots
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
+from mitsuba_ext.bases.bidirectional_integrator import BidirectionalIntegrator
 from mitsuba_ext.startup import registry
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.slots import SLOTS, read_slot
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.slots import SLOTS, read_slot
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 
 

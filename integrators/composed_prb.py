@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators import common
 
-from mitsuba_ext.composition.remembering_path import RememberingPath
-from mitsuba_ext.composition.sensitive_path import SensitivePath
+from mitsuba_ext.bases.remembering_path import RememberingPath
+from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import refuse_geometry

@@ -8,19 +8,19 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.composition.wrapping_integrator import WrappingIntegrator
-from mitsuba_ext.decisions.query.scene import scene_query
-from mitsuba_ext.defocus.filters import FILTERS
-from mitsuba_ext.defocus.thin_lens import ThinLens
+from mitsuba_ext.bases.wrapping_integrator import WrappingIntegrator
+from mitsuba_ext.estimators.defocus.filters import FILTERS
+from mitsuba_ext.estimators.defocus.layered_job import LayeredJob
+from mitsuba_ext.estimators.defocus.pinhole import LensCentre
+from mitsuba_ext.estimators.defocus.thin_lens import ThinLens
 from mitsuba_ext.images.denoising import denoiser
-from mitsuba_ext.parameters import MOST_SPP
-from mitsuba_ext.rendering.layered_job import LayeredJob
-from mitsuba_ext.rendering.pinhole import LensCentre
 from mitsuba_ext.rendering.render import render
 from mitsuba_ext.rendering.stages import Schedule, Stage
 from mitsuba_ext.scene.movers import is_moving_camera
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import SceneQuery
+from mitsuba_ext.transport.queries.scene import scene_query
+from mitsuba_ext.util.parameters import MOST_SPP
 
 #: The sensors whose rays begin in the middle of a lens, or can begin there.
 _SENSORS = ("ThinLensCamera", "PerspectiveCamera")

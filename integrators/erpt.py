@@ -6,22 +6,22 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
-from mitsuba_ext.composition.path_mutations import (
+from mitsuba_ext.bases.metropolis_integrator import MetropolisIntegrator
+from mitsuba_ext.bases.path_mutations import (
     MOST,
     camera_samples,
     described,
     path_target,
     read_switches,
 )
-from mitsuba_ext.metropolis.chains.noise_filters import NoiseFilters
-from mitsuba_ext.metropolis.chains.path_target import PathTarget
-from mitsuba_ext.metropolis.chains.redistribution import (
+from mitsuba_ext.estimators.chains.noise_filters import NoiseFilters
+from mitsuba_ext.estimators.chains.path_target import PathTarget
+from mitsuba_ext.estimators.chains.redistribution import (
     RedistributionRender,
     RedistributionSettings,
 )  # fmt: skip
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
-from mitsuba_ext.metropolis.chains.target import ImageTarget
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.chains.target import ImageTarget
 from mitsuba_ext.startup import registry
 
 #: The parameters that only chains of primary samples have.

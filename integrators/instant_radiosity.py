@@ -8,18 +8,29 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.instant_radiosity import InstantRadiosity, Tally
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.merging import scene_diagonal
-from mitsuba_ext.bidirectional.virtual_light_bound import Bound
-from mitsuba_ext.bidirectional.virtual_light_choice import PowerChoice, UniformChoice
-from mitsuba_ext.bidirectional.virtual_light_parts import LIGHTS, PARTS, AllDirect, PictureOfLights
-from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
-from mitsuba_ext.bidirectional.virtual_lights import MOST_PATHS, Sets
-from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.composition.slots import read_slot
-from mitsuba_ext.composition.subpath_selection import LearnedSubpaths
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.slots import read_slot
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.estimators.light_paths.light_side import LightSide
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.merging.merging import scene_diagonal
+from mitsuba_ext.estimators.light_paths.subpath_choice.parameters import LearnedSubpaths
+from mitsuba_ext.estimators.light_paths.virtual_lights.instant_radiosity import (
+    InstantRadiosity,
+    Tally,
+)
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_bound import Bound
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_choice import (
+    PowerChoice,
+    UniformChoice,
+)
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_parts import (
+    LIGHTS,
+    PARTS,
+    AllDirect,
+    PictureOfLights,
+)
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_tree import ClusteredChoice
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_lights import MOST_PATHS, Sets
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers

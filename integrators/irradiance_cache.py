@@ -10,16 +10,16 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition import learned_file
-from mitsuba_ext.composition.irradiance_rounds import CacheParameters, CacheRounds, deadline
-from mitsuba_ext.composition.slots import read_slot
-from mitsuba_ext.composition.staged_integrator import NO_LIMIT
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.irradiance.cached_light import CachedLight, CameraPhases, EndsAtTheCache
-from mitsuba_ext.irradiance.gathering import Gatherer
-from mitsuba_ext.irradiance.hemisphere import Strata
-from mitsuba_ext.irradiance.record_grid import RecordGrid
-from mitsuba_ext.irradiance.records import Records
+from mitsuba_ext.bases.slots import read_slot
+from mitsuba_ext.bases.staged_integrator import NO_LIMIT
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.estimators.caches.cached_light import CachedLight, CameraPhases, EndsAtTheCache
+from mitsuba_ext.estimators.caches.gathering import Gatherer
+from mitsuba_ext.estimators.caches.hemisphere import Strata
+from mitsuba_ext.estimators.caches.irradiance_rounds import CacheParameters, CacheRounds, deadline
+from mitsuba_ext.estimators.caches.record_grid import RecordGrid
+from mitsuba_ext.estimators.caches.records import Records
+from mitsuba_ext.planning import learned_file
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry

@@ -6,13 +6,13 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_tracer import LightTracer
-from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
-from mitsuba_ext.bidirectional.sensor import ConnectableSensor
-from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
+from mitsuba_ext.estimators.light_paths.light_vertices import Layout, bytes_per_vertex
+from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
+from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves

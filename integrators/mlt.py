@@ -6,17 +6,17 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.chain_integrator import ChainIntegrator
-from mitsuba_ext.composition.long_chains import LongChains
-from mitsuba_ext.composition.path_mutations import (
+from mitsuba_ext.bases.chain_integrator import ChainIntegrator
+from mitsuba_ext.bases.long_chains import LongChains
+from mitsuba_ext.bases.path_mutations import (
     MOST,
     camera_samples,
     described,
     path_target,
     read_switches,
 )
-from mitsuba_ext.metropolis.chains.path_target import PathTarget
-from mitsuba_ext.metropolis.chains.visits import MetropolisRender
+from mitsuba_ext.estimators.chains.path_target import PathTarget
+from mitsuba_ext.estimators.chains.visits import MetropolisRender
 from mitsuba_ext.startup import registry
 
 

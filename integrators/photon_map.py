@@ -9,12 +9,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.merging import median_footprint
-from mitsuba_ext.bidirectional.photon_directions import PhotonDirections
-from mitsuba_ext.bidirectional.photon_maps import PhotonMaps, PhotonSubpaths, photon_walk
-from mitsuba_ext.bidirectional.photon_phases import (
+from mitsuba_ext.bases.slots import read_slot
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
+from mitsuba_ext.estimators.light_paths.photons.photon_directions import PhotonDirections
+from mitsuba_ext.estimators.light_paths.photons.photon_maps import (
+    PhotonMaps,
+    PhotonSubpaths,
+    photon_walk,
+)
+from mitsuba_ext.estimators.light_paths.photons.photon_phases import (
     ENDED,
     GATHERS_ON,
     EndsWithTheGather,
@@ -22,8 +28,6 @@ from mitsuba_ext.bidirectional.photon_phases import (
     first_vertex,
     is_diffuse,
 )
-from mitsuba_ext.composition.slots import read_slot
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.connections import Connections
-from mitsuba_ext.composition.decision_parameters import ParameterReader
-from mitsuba_ext.composition.directions import Guided
-from mitsuba_ext.composition.roulette import GuidedRoulette
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
-from mitsuba_ext.learning.directions.guide_learner import GuideLearner
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.planning.decision_parameters import ParameterReader
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
+from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
+from mitsuba_ext.techniques.guided_directions.parameters import Guided
+from mitsuba_ext.techniques.guided_directions.roulette_parameters import GuidedRoulette
+from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
 @registry.plugin

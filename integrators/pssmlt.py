@@ -6,10 +6,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.long_chains import LongChains
-from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
-from mitsuba_ext.metropolis.chains.target import ImageTarget
-from mitsuba_ext.metropolis.chains.visits import MetropolisRender
+from mitsuba_ext.bases.long_chains import LongChains
+from mitsuba_ext.bases.metropolis_integrator import MetropolisIntegrator
+from mitsuba_ext.estimators.chains.target import ImageTarget
+from mitsuba_ext.estimators.chains.visits import MetropolisRender
 from mitsuba_ext.startup import registry
 
 

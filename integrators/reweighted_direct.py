@@ -6,9 +6,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.connections import Connections
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
 @registry.plugin

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
+from mitsuba_ext.bases.reweighted_camera import ReweightedCamera
 from mitsuba_ext.startup import registry
 
 

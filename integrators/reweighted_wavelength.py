@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
+from mitsuba_ext.bases.reweighted_camera import ReweightedCamera
 from mitsuba_ext.startup import registry
 
 

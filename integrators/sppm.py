@@ -7,11 +7,14 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.photon_mapper import most_lanes
-from mitsuba_ext.composition.light_paths import MOST_PATHS, check_shared_rays
-from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
-from mitsuba_ext.composition.photons import photon_mapper
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.estimators.light_paths.choice.light_paths import MOST_PATHS, check_shared_rays
+from mitsuba_ext.estimators.light_paths.merging.merging_parameters import (
+    MergingParameters,
+    share_rays,
+)
+from mitsuba_ext.estimators.light_paths.photons.photon_mapper import most_lanes
+from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.swarm import MAPS
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.swarming.parameters import MAPS
 
 #: For each parameter, the slot that its maps fill.
 _SLOTS = {
@@ -114,7 +114,7 @@ class SwarmPath(WalkIntegrator):
     root, with 20 %), and by how much it lowers the variance. A map that lowers it by less than 10 %
     is not used, and is dropped after 4 samples per pixel. After a render,
     :monosp:`integrator.statistics.learned` describes what was learned, and
-    :monosp:`mitsuba_ext.composition.pixel_maps` has the maps of a pixel as arrays (see
+    :monosp:`mitsuba_ext.techniques.swarming.pixel_maps` has the maps of a pixel as arrays (see
     examples/swarm_maps.py).
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use

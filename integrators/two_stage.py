@@ -6,11 +6,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.connections import Connections
-from mitsuba_ext.composition.decision_parameters import ParameterReader
-from mitsuba_ext.composition.next_event import TwoStageLights
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.bases.walk_integrator import WalkIntegrator
+from mitsuba_ext.planning.decision_parameters import ParameterReader
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.next_event import TwoStageLights
+from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
 @registry.plugin

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.parameters import MOST_SPP, read_parameter
 from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.rendering.camera import develop as develop_film
 from mitsuba_ext.rendering.camera import find_sensor
@@ -18,6 +17,7 @@ from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.rendering.turns import in_turn, let_others, tell
 from mitsuba_ext.scene.nesting import refuse_checkpoint
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.parameters import MOST_SPP, read_parameter
 
 _PREFIX = "variance."
 

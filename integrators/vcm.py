@@ -6,8 +6,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
-from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.bases.bidirectional_integrator import BidirectionalIntegrator
+from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
 from mitsuba_ext.startup import registry
 
 

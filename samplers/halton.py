@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.sequences.halton import Halton
-from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+from mitsuba_ext.bases.sequence_sampler import SequenceSampler
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.sequences.halton import Halton
 
 
 @registry.plugin

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.sequences.latin_hypercube import LatinHypercube
-from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+from mitsuba_ext.bases.sequence_sampler import SequenceSampler
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.sequences.latin_hypercube import LatinHypercube
 
 
 @registry.plugin

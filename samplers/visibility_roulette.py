@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mitsuba_ext.composition.decision_plugin import DecisionPlugin
-from mitsuba_ext.composition.shadow_test import RejectedShadowRays
+from mitsuba_ext.bases.decision_plugin import DecisionPlugin
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.shadow_rejection.parameters import RejectedShadowRays
 
 
 @registry.plugin

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mitsuba_ext.composition.connections import Connections
-from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.bases.decision_plugin import DecisionPlugin
 from mitsuba_ext.startup import registry
+from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
 @registry.plugin
@@ -35,8 +35,8 @@ class WeightedConnectionsPlugin(DecisionPlugin):
        - |string|
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
          :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
-         :monosp:`lattice` or :monosp:`poisson_disk`; see :monosp:`mitsuba_ext.pointsets.points`.
-         (Default: hammersley)
+         :monosp:`lattice` or :monosp:`poisson_disk`; see
+         :monosp:`mitsuba_ext.util.pointsets.points`. (Default: hammersley)
      * - weights
        - |string|
        - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas of periodic

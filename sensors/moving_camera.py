@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.motion.motion_parameters import read_motion
-from mitsuba_ext.motion.rigid_motion import Motion, PoseTable
+from mitsuba_ext.scene.motion.motion_parameters import read_motion
+from mitsuba_ext.scene.motion.rigid_motion import Motion, PoseTable
 from mitsuba_ext.scene.nesting import class_name
 from mitsuba_ext.startup import registry
 

@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.lightweight.geometry import Lightweight
-from mitsuba_ext.lightweight.height_tree import MOST_CELLS, HeightTree, cell
-from mitsuba_ext.lightweight.interaction import Triangle, surface_interaction
-from mitsuba_ext.parameters import read_parameter
+from mitsuba_ext.scene.lightweight.geometry import Lightweight
+from mitsuba_ext.scene.lightweight.height_tree import MOST_CELLS, HeightTree, cell
+from mitsuba_ext.scene.lightweight.interaction import Triangle, surface_interaction
 from mitsuba_ext.scene.placeholder import span
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.parameters import read_parameter
 
 #: Where the heights may come from.
 _SOURCES = ("filename", "bitmap", "data")

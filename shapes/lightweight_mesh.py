@@ -5,12 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
-from mitsuba_ext.lightweight.packed_mesh import PackedMesh
-from mitsuba_ext.parameters import read_parameter
 from mitsuba_ext.scene.bounds import shape_bounds
+from mitsuba_ext.scene.lightweight.mesh_geometry import MeshGeometry
+from mitsuba_ext.scene.lightweight.packed_mesh import PackedMesh
 from mitsuba_ext.scene.placeholder import span
 from mitsuba_ext.startup import registry
+from mitsuba_ext.util.parameters import read_parameter
 
 
 @registry.plugin

@@ -8,12 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.bidirectional.connections import End, joining_rivals, joining_weight
-from mitsuba_ext.bidirectional.emission import EmittedRay, LightEmission
-from mitsuba_ext.bidirectional.partial_sums import PartialSums, weight
-from mitsuba_ext.bidirectional.scattering import cosine_of_delta, geometric_cosine, reverse_density
-from mitsuba_ext.bidirectional.sensor import ConnectableSensor
-from mitsuba_ext.bidirectional.weights import BidirectionalWeights
+from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
+from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
+from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, weight
+from mitsuba_ext.estimators.light_paths.scattering import (
+    cosine_of_delta,
+    geometric_cosine,
+    reverse_density,
+)
+from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
+from mitsuba_ext.estimators.light_paths.weights import BidirectionalWeights
 from mitsuba_ext.transport.emission import emission
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery, SubpathSelection
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex

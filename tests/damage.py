@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_ext.stored import archives
+from mitsuba_ext.util import archives
 
 #: Numbers that are no lanes, no lengths, no probabilities.
 _ODD = (0, 1, -1, 2, 127, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63, np.nan, np.inf, -np.inf,

@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.lights.division import emitter_shapes
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.division import emitter_shapes
+from mitsuba_ext.scene.lights.light_cells import LightCells
 
 #: All lights lie around here and are about two wide; they are seen from the origin.
 CENTER = np.array([0.3, -0.4, 3.0])

@@ -9,12 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
-from mitsuba_ext.lights.choice import Choice
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.maps.light_map import LightMap
-from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
-from mitsuba_ext.regions.surface_sides import region
+from mitsuba_ext.scene.lights.choice import Choice
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.regions.surface_rows import SurfaceRows, voxel_edges
+from mitsuba_ext.scene.regions.surface_sides import region
+from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
+from mitsuba_ext.techniques.learned_lights.light_map import LightMap
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 

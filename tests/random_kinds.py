@@ -18,7 +18,7 @@ from motions import Pose, keyed, uniform
 from random_scenes import Maker, NestedMaker, Scene
 from scipy.spatial.transform import Rotation
 
-from mitsuba_ext.materials.glass import GLASSES
+from mitsuba_ext.transport.materials.glass import GLASSES
 
 
 @dataclass(frozen=True)

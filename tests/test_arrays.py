@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.arrays import from_numpy
+from mitsuba_ext.util.arrays import from_numpy
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -20,7 +20,8 @@ from statistical import (
 )
 from test_light_tracer import EMITTERS, below_the_lamp
 
-from mitsuba_ext.composition import light_path_schedule, light_paths
+from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.estimators.light_paths.choice import light_paths
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,9 +10,10 @@ import pytest
 from fogs import cube, fog, homogeneous
 from stage import area, lookat
 
-from mitsuba_ext.composition import light_path_schedule, photon_trial
-from mitsuba_ext.composition.photon_trial import PhotonTrial
-from mitsuba_ext.composition.promise import Promise
+from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.estimators.light_paths.choice import photon_trial
+from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonTrial
+from mitsuba_ext.planning.promise import Promise
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -13,16 +13,16 @@ from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
 from statistical import some
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
 
-from mitsuba_ext.bidirectional.both_ends import FromBothEnds, from_both_ends
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.sensor import ConnectableSensor
-from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.composition.next_event import sampling_weights
-from mitsuba_ext.decisions.next_event.light_table import LightTable
-from mitsuba_ext.decisions.subpaths.region_table import RegionTable
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.regions.nested_regions import NestedRegions
-from mitsuba_ext.regions.surface_rows import SurfaceRows
+from mitsuba_ext.estimators.light_paths.both_ends import FromBothEnds, from_both_ends
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
+from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
+from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.regions.nested_regions import NestedRegions
+from mitsuba_ext.scene.regions.surface_rows import SurfaceRows
+from mitsuba_ext.techniques.next_event import sampling_weights
+from mitsuba_ext.transport.light_table import LightTable
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
 
 pytestmark = pytest.mark.usefixtures("variant")

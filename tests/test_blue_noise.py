@@ -78,7 +78,7 @@ def test_numbers_of_a_pixel_are_uniform() -> None:
 
 
 def test_quarters_of_a_square_are_in_any_order() -> None:
-    from mitsuba_ext.sequences.pixel_order import shuffled
+    from mitsuba_ext.util.sequences.pixel_order import shuffled
 
     seeds = 4800
     seed = mi.UInt32(np.repeat(np.arange(seeds, dtype=np.uint32), 16))

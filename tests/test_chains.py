@@ -13,12 +13,12 @@ from hard_cases import film, sensor, stage
 from scipy import stats
 from statistical import THRESHOLD, sidak, z_exact
 
-from mitsuba_ext.metropolis.chains.bootstrap import Bootstrap
-from mitsuba_ext.metropolis.chains.chains import ChainRules, Chains, Counts
-from mitsuba_ext.metropolis.chains.looped import LoopedChains
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
-from mitsuba_ext.metropolis.chains.stepped import SteppedChains
-from mitsuba_ext.metropolis.chains.target import Contribution, ImageTarget
+from mitsuba_ext.estimators.chains.bootstrap import Bootstrap
+from mitsuba_ext.estimators.chains.chains import ChainRules, Chains, Counts
+from mitsuba_ext.estimators.chains.looped import LoopedChains
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.chains.stepped import SteppedChains
+from mitsuba_ext.estimators.chains.target import Contribution, ImageTarget
 from mitsuba_ext.rendering.filter_weights import mean_weights
 from mitsuba_ext.transport.estimator import Sample
 from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers

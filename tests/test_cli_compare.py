@@ -101,7 +101,7 @@ def test_several_scenes_are_compared_in_turn(run, make_scene, tmp_path):
 def test_progress_goes_to_a_file_line_by_line(
     run, make_scene, tmp_path, monkeypatch, without_report
 ):
-    monkeypatch.setattr("mitsuba_ext.progress.PERIOD", 0.0)
+    monkeypatch.setattr("mitsuba_ext.compare.progress.PERIOD", 0.0)
     command = ("compare", make_scene(), "path", "prb", "--spp", 4, "--seeds", 2)
     _, _, err = run(*command, "--reference-spp", 64, "--out", tmp_path)
     name = tmp_path.name

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from conftest import PATH, PLAIN_PATH
 
-from mitsuba_ext import marks
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import load_scene, read_exr, timing, write_exr
@@ -28,6 +27,7 @@ from mitsuba_ext.images import image_files
 from mitsuba_ext.inputs.scene_remarks import scene_remarks
 from mitsuba_ext.rendering import interrupts, plan, seed_passes
 from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.util import marks
 
 
 def test_render_writes_an_exr_with_metadata(run, make_scene, tmp_path):

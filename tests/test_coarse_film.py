@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_ext.bidirectional.merging_radius import MergingRadius
+from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
 from mitsuba_ext.images.coarse_film import CoarseFilm
 
 

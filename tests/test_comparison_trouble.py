@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from noisy import WHITE, compare_noisy, noisy_integrator
 
-from mitsuba_ext import compare, marks, progress
-from mitsuba_ext.compare import InputError, experiment
+from mitsuba_ext import compare
+from mitsuba_ext.compare import InputError, experiment, progress
 from mitsuba_ext.compare.experiment import run_seed
+from mitsuba_ext.util import marks
 
 import mitsuba as mi  # isort: skip
 

@@ -13,7 +13,7 @@ from fogs import fog
 from hard_cases import area, bitmap, diffuse, rectangle, rgb, stage
 from statistical import load
 
-from mitsuba_ext.errors import one_line
+from mitsuba_ext.util.errors import one_line
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -15,14 +15,14 @@ import pytest
 from damage import contents, damaged, damages, edits
 from stage import film, sensor, stage
 
-from mitsuba_ext.errors import InputError
-from mitsuba_ext.learning.subpaths import region_learner
+from mitsuba_ext.estimators.light_paths.subpath_choice import region_learner
 from mitsuba_ext.long_renders.bundle import Bundle, _digest
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.state import Batch, BatchResult, RenderState
-from mitsuba_ext.maps import light_map_file
 from mitsuba_ext.rendering.totals import RenderTotals
-from mitsuba_ext.stored import archives
+from mitsuba_ext.techniques.learned_lights import light_map_file
+from mitsuba_ext.util import archives
+from mitsuba_ext.util.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("variant")
 

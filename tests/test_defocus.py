@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from mitsuba_ext.defocus import filters, layers, lens_points
-from mitsuba_ext.defocus.images import Size, filled
-from mitsuba_ext.defocus.near_field import near_field
-from mitsuba_ext.defocus.thin_lens import ThinLens
+from mitsuba_ext.estimators.defocus import filters, layers, lens_points
+from mitsuba_ext.estimators.defocus.images import Size, filled
+from mitsuba_ext.estimators.defocus.near_field import near_field
+from mitsuba_ext.estimators.defocus.thin_lens import ThinLens
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -7,16 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.defocus import highlights
-from mitsuba_ext.defocus.images import Pyramid, Size
-from mitsuba_ext.defocus.layers import (
+from mitsuba_ext.estimators.defocus import highlights
+from mitsuba_ext.estimators.defocus.images import Pyramid, Size
+from mitsuba_ext.estimators.defocus.layers import (
     IN_FOCUS,
     LayerSums,
     Limits,
     layers_from_sums,
     sums_of_picture,
 )
-from mitsuba_ext.defocus.lens_filter import lens_filter
+from mitsuba_ext.estimators.defocus.lens_filter import lens_filter
 
 pytestmark = pytest.mark.usefixtures("variant")
 

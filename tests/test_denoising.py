@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.compare import InputError, read_exr
-from mitsuba_ext.composition.guides import render_guides
 from mitsuba_ext.images import denoising, image_files
 from mitsuba_ext.images.metrics import relative_mse
+from mitsuba_ext.rendering.scene_guides import render_guides
 
 pytestmark = pytest.mark.usefixtures("variant")
 

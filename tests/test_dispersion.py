@@ -17,10 +17,10 @@ from glass_objects import WRAPPERS, wrapped
 from statistical import batches, compare_pixels, sidak, z_of_means, z_welch
 from techniques import TECHNIQUES
 
-from mitsuba_ext.materials.glass import GLASSES
 from mitsuba_ext.startup.garbage import garbage_left_alone
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.heroes import DISPERSES, Heroes, disperses, warn_of_sampler
+from mitsuba_ext.transport.materials.glass import GLASSES
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from glass_objects import WRAPPERS, wrapped
 
-from mitsuba_ext.materials.glass import GLASSES
 from mitsuba_ext.transport.heroes import DISPERSES
+from mitsuba_ext.transport.materials.glass import GLASSES
 
 pytestmark = pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 

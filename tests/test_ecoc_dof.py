@@ -10,7 +10,7 @@ import pytest
 from hard_cases import area, diffuse, film, rectangle, sensor, stage
 from statistical import batches
 
-from mitsuba_ext.rendering.layer_samples import least_blur_around
+from mitsuba_ext.estimators.defocus.layer_samples import least_blur_around
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.discrete_sampling import alias_tables
-from mitsuba_ext.lights.environment_bins import BINS, EnvironmentBins
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.lights.spectra import brightness, comparison_wavelengths
-from mitsuba_ext.lights.sun import SunDisk
-from mitsuba_ext.lights.tabulated_bins import TabulatedBins
+from mitsuba_ext.scene.lights.environment_bins import BINS, EnvironmentBins
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.spectra import brightness, comparison_wavelengths
+from mitsuba_ext.scene.lights.sun import SunDisk
+from mitsuba_ext.scene.lights.tabulated_bins import TabulatedBins
+from mitsuba_ext.util.discrete_sampling import alias_tables
 
 LANES = 1 << 18
 

@@ -23,9 +23,9 @@ from statistical import (
 from techniques import REFERENCE
 from test_chains import TARGETS
 
-from mitsuba_ext.metropolis.chains.bootstrap import Bootstrap
-from mitsuba_ext.metropolis.chains.chain_image import ChainImage
-from mitsuba_ext.metropolis.chains.looped import LoopedChains
+from mitsuba_ext.estimators.chains.bootstrap import Bootstrap
+from mitsuba_ext.estimators.chains.chain_image import ChainImage
+from mitsuba_ext.estimators.chains.looped import LoopedChains
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -150,7 +150,7 @@ def test_an_error_amid_a_batch_leaves_the_batches_before_it(
 ) -> None:
     """Also a second Ctrl-C, in chains or in samples: half of a batch would not have the right
     mean."""
-    monkeypatch.setattr("mitsuba_ext.metropolis.chains.redistribution._BATCH", 16 * 16 * 16)
+    monkeypatch.setattr("mitsuba_ext.estimators.chains.redistribution._BATCH", 16 * 16 * 16)
     scene, integrator = mi.load_dict(stage(glass=_GLASS)), erpt(outliers=1.0, direct_samples=8)
     (expected,) = batches(scene, integrator, 16, [5])
     fails = LoopedChains if chains else ChainImage

@@ -18,11 +18,11 @@ from mitsuba_ext import cli
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import write_exr
 from mitsuba_ext.compare.experiment import Experiment
-from mitsuba_ext.errors import InputError
 from mitsuba_ext.images import denoising, image_files
 from mitsuba_ext.inputs.chosen import LastScene
 from mitsuba_ext.rendering.seed_passes import SeedPasses
 from mitsuba_ext.startup import doctor
+from mitsuba_ext.util.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("variant")
 

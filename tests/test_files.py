@@ -10,11 +10,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from mitsuba_ext import marks
-from mitsuba_ext.errors import InputError
-from mitsuba_ext.files import replacing
-from mitsuba_ext.stored import archives
-from mitsuba_ext.stored.arrays import DamagedError
+from mitsuba_ext.util import archives, marks
+from mitsuba_ext.util.errors import InputError
+from mitsuba_ext.util.files import replacing
+from mitsuba_ext.util.stored_arrays import DamagedError
 
 
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):

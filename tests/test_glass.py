@@ -7,7 +7,7 @@ import math
 import pytest
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit)
-from mitsuba_ext.materials.glass import GLASSES, Cauchy, Constant, Sellmeier, check_index
+from mitsuba_ext.transport.materials.glass import GLASSES, Cauchy, Constant, Sellmeier, check_index
 
 #: Fraunhofer's lines F, d and C, in nm.
 F, D, C = 486.1327, 587.5618, 656.2725

@@ -12,7 +12,7 @@ import pytest
 from stage import diffuse, film, rgb, sensor, stage
 from statistical import assert_same_quarters, batches
 
-from mitsuba_ext.luminaires.ies import read_ies
+from mitsuba_ext.scene.luminaires.ies import read_ies
 
 pytestmark = pytest.mark.usefixtures("variant")
 

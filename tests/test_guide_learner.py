@@ -11,13 +11,13 @@ import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor
 from maps import vertex_at
 
-from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
-from mitsuba_ext.learning.directions.guide_learner import GuideLearner, most_efficient
-from mitsuba_ext.learning.directions.path_records import BYTES_PER_RECORD, PathRecords
-from mitsuba_ext.learning.directions.surface_regions import SurfaceRegions
-from mitsuba_ext.learning.directions.tile_regions import TileRegions
-from mitsuba_ext.learning.pixel_estimates import PixelEstimates
+from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.planning.pixel_estimates import PixelEstimates
+from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
+from mitsuba_ext.techniques.guided_directions.learner import GuideLearner, most_efficient
+from mitsuba_ext.techniques.guided_directions.path_records import BYTES_PER_RECORD, PathRecords
+from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
+from mitsuba_ext.techniques.guided_directions.tile_regions import TileRegions
 from mitsuba_ext.transport.path_decisions import DirectionSamples
 
 pytestmark = pytest.mark.usefixtures("variant")

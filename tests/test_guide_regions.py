@@ -11,12 +11,12 @@ import pytest
 from hard_cases import diffuse, sensor, stage
 from maps import vertex_at
 
-from mitsuba_ext.learning.directions.path_records import PathRecords
-from mitsuba_ext.learning.directions.surface_regions import SurfaceRegions
-from mitsuba_ext.learning.directions.tile_regions import TileRegions
-from mitsuba_ext.learning.directions.tree_builder import cell_code
-from mitsuba_ext.learning.pixel_estimates import PixelEstimates
-from mitsuba_ext.maps.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.planning.pixel_estimates import PixelEstimates
+from mitsuba_ext.techniques.guided_directions.path_records import PathRecords
+from mitsuba_ext.techniques.guided_directions.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
+from mitsuba_ext.techniques.guided_directions.tile_regions import TileRegions
+from mitsuba_ext.techniques.guided_directions.tree_builder import cell_code
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.arrays import from_numpy
-from mitsuba_ext.lightweight.height_tree import cell
-from mitsuba_ext.lightweight.traversal import NONE
+from mitsuba_ext.scene.lightweight.height_tree import cell
+from mitsuba_ext.scene.lightweight.traversal import NONE
+from mitsuba_ext.util.arrays import from_numpy
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -27,20 +27,20 @@ from test_furnace import FURNACES
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
 from test_photon_map import things
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.photon_history import VertexRegions
-from mitsuba_ext.bidirectional.virtual_light_bound import Link
-from mitsuba_ext.bidirectional.virtual_light_choice import (
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.photons.photon_history import VertexRegions
+from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_bound import Link
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_choice import (
     LearnedChoice,
     PowerChoice,
     UniformChoice,
 )
-from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
-from mitsuba_ext.bidirectional.virtual_lights import Sets, VirtualLights
-from mitsuba_ext.decisions.subpaths.region_table import RegionTable
-from mitsuba_ext.regions.nested_regions import NestedRegions
-from mitsuba_ext.regions.surface_sides import lit_normal
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_tree import ClusteredChoice
+from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_lights import Sets, VirtualLights
+from mitsuba_ext.scene.regions.nested_regions import NestedRegions
+from mitsuba_ext.scene.regions.surface_sides import lit_normal
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 

@@ -13,10 +13,10 @@ import pytest
 from stage import film, lookat, sensor, stage
 from statistical import assert_same_mean, batches, load
 
-from mitsuba_ext.irradiance.choice import chosen
-from mitsuba_ext.irradiance.hemisphere import Strata, irradiance, without_outliers
-from mitsuba_ext.irradiance.record_grid import RecordGrid
-from mitsuba_ext.irradiance.records import Places, Records
+from mitsuba_ext.estimators.caches.choice import chosen
+from mitsuba_ext.estimators.caches.hemisphere import Strata, irradiance, without_outliers
+from mitsuba_ext.estimators.caches.record_grid import RecordGrid
+from mitsuba_ext.estimators.caches.records import Places, Records
 
 pytestmark = pytest.mark.usefixtures("variant")
 

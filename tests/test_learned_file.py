@@ -10,8 +10,8 @@ import pytest
 from stage import film, sensor, stage
 from statistical import load, one_thread, some
 
-from mitsuba_ext.composition import kept_learning
 from mitsuba_ext.inputs.plugin_text import parse_plugin
+from mitsuba_ext.planning import kept_learning
 
 pytestmark = pytest.mark.usefixtures("variant")
 

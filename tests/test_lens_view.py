@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, sensor
 
-from mitsuba_ext.bidirectional.depth_maps import DepthMaps
-from mitsuba_ext.rendering.layer_samples import outside_pixels
-from mitsuba_ext.rendering.layered_job import LayeredJob
+from mitsuba_ext.estimators.defocus.layer_samples import outside_pixels
+from mitsuba_ext.estimators.defocus.layered_job import LayeredJob
+from mitsuba_ext.estimators.light_paths.depth_maps import DepthMaps
 from mitsuba_ext.transport.lens_view import LensView
 from mitsuba_ext.transport.path_decisions import SceneQuery
 

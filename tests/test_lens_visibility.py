@@ -13,8 +13,8 @@ from scipy import stats
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, some
 from test_light_tracer import MANY_SEEDS, T
 
-from mitsuba_ext.bidirectional.lens_visibility import VisibilityLens, visibility_lens
-from mitsuba_ext.bidirectional.sensor import ConnectableSensor, UniformLens, is_occluded
+from mitsuba_ext.estimators.light_paths.lens_visibility import VisibilityLens, visibility_lens
+from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor, UniformLens, is_occluded
 from mitsuba_ext.transport.numbers import hashed_2d
 from mitsuba_ext.transport.path_decisions import SceneQuery
 

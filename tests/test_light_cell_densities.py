@@ -9,7 +9,7 @@ import pytest
 from lights import LANES, SHAPES, SQUARE, VOXEL, agree, mesh, mixed_scene, samples_of, scene_with
 from scipy import stats
 
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.light_cells import LightCells
 
 pytestmark = pytest.mark.usefixtures("variant")
 

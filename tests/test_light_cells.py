@@ -21,8 +21,8 @@ from lights import (
     scene_with,
 )
 
-from mitsuba_ext.lights.division import divide
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.division import divide
+from mitsuba_ext.scene.lights.light_cells import LightCells
 
 pytestmark = pytest.mark.usefixtures("variant")
 

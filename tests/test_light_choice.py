@@ -9,13 +9,15 @@ import pytest
 from lights import ball
 from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertex_at
 
-from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
-from mitsuba_ext.learning.benefit import SEGMENT, SHADOW, TABLE
-from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
-from mitsuba_ext.learning.shadow_test.light_map_roulette_learner import LightMapRouletteLearner
-from mitsuba_ext.lights import weights as lights_weights
-from mitsuba_ext.lights.choice import Choice
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.planning.benefit import SEGMENT, SHADOW, TABLE
+from mitsuba_ext.scene.lights import weights as lights_weights
+from mitsuba_ext.scene.lights.choice import Choice
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
+from mitsuba_ext.techniques.shadow_rejection.light_map_roulette_learner import (
+    LightMapRouletteLearner,
+)
+from mitsuba_ext.transport.light_table import LightTable, OneRow
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -20,8 +20,8 @@ from statistical import (
     some,
 )
 
-from mitsuba_ext.bidirectional.light_directions import NOT_RECIPROCAL, LightDirections
-from mitsuba_ext.bidirectional.scattering import adjoint_value
+from mitsuba_ext.estimators.light_paths.light_directions import NOT_RECIPROCAL, LightDirections
+from mitsuba_ext.estimators.light_paths.scattering import adjoint_value
 from mitsuba_ext.scene import bsdfs
 from mitsuba_ext.scene.bsdfs import bsdf_table
 

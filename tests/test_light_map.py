@@ -23,16 +23,16 @@ from maps import (
 )
 from statistical import assert_same_mean
 
-from mitsuba_ext.decisions.next_event.light_table import LightTable
-from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRoulette
-from mitsuba_ext.learning.scout import Scout
-from mitsuba_ext.lights.choice import Choice
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.lights.shutter_times import ShutterTimes
-from mitsuba_ext.maps.light_map import LightMap
-from mitsuba_ext.regions.surface_rows import RowCounts, SurfaceRows
-from mitsuba_ext.regions.surface_sides import region
+from mitsuba_ext.planning.scout import Scout
+from mitsuba_ext.scene.lights.choice import Choice
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.shutter_times import ShutterTimes
+from mitsuba_ext.scene.regions.surface_rows import RowCounts, SurfaceRows
+from mitsuba_ext.scene.regions.surface_sides import region
+from mitsuba_ext.techniques.learned_lights.light_map import LightMap
+from mitsuba_ext.techniques.shadow_rejection.light_map_roulette import LightMapRoulette
 from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.light_table import LightTable
 
 pytestmark = pytest.mark.usefixtures("variant")
 

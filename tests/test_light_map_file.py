@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from maps import floor, lamp, map_of
 
-from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
-from mitsuba_ext.lights.division import emitter_shapes
-from mitsuba_ext.maps import light_map_file
-from mitsuba_ext.maps.light_map_file import FORM
-from mitsuba_ext.stored import archives
+from mitsuba_ext.scene.lights.division import emitter_shapes
+from mitsuba_ext.techniques.learned_lights import light_map_file
+from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
+from mitsuba_ext.techniques.learned_lights.light_map_file import FORM
+from mitsuba_ext.util import archives
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,12 +13,12 @@ from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, l
 from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
 
-from mitsuba_ext.bidirectional import path_tracer
-from mitsuba_ext.bidirectional.candidates import Available, Candidate, candidates
-from mitsuba_ext.bidirectional.merging_radius import MergingRadius
-from mitsuba_ext.bidirectional.path_moments import Counts, PathMoments
-from mitsuba_ext.bidirectional.vertex_choice import Chosen, VertexChoice
-from mitsuba_ext.composition import light_paths
+from mitsuba_ext.estimators.light_paths import path_tracer
+from mitsuba_ext.estimators.light_paths.choice import light_paths
+from mitsuba_ext.estimators.light_paths.choice.candidates import Available, Candidate, candidates
+from mitsuba_ext.estimators.light_paths.choice.path_moments import Counts, PathMoments
+from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
+from mitsuba_ext.estimators.light_paths.vertex_choice import Chosen, VertexChoice
 
 pytestmark = pytest.mark.usefixtures("variant")
 

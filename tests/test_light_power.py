@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from maps import connect, floor, lamp, surface
 
-from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
-from mitsuba_ext.decisions.next_event.linear_lights import LinearChoice
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.lights.power import emitter_powers
-from mitsuba_ext.lights.spectra import brightness
-from mitsuba_ext.lights.weights import power_weights
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.power import emitter_powers
+from mitsuba_ext.scene.lights.spectra import brightness
+from mitsuba_ext.scene.lights.weights import power_weights
+from mitsuba_ext.techniques.linear_lights.linear_lights import LinearChoice
+from mitsuba_ext.transport.light_table import LightTable, OneRow
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from stage import mesh
 
-from mitsuba_ext.lightweight.building import INNER_BITS, TOP
-from mitsuba_ext.lightweight.heap import ARITY, CAPACITY, HEAP_BITS, LEAF_SIZE, Heap
-from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
-from mitsuba_ext.lightweight.mesh_tree import MeshTree, _boxes
-from mitsuba_ext.lightweight.nodes import MIN_EXPONENT
-from mitsuba_ext.lightweight.packed_mesh import PackedMesh
-from mitsuba_ext.lightweight.traversal import NONE
+from mitsuba_ext.scene.lightweight.building import INNER_BITS, TOP
+from mitsuba_ext.scene.lightweight.heap import ARITY, CAPACITY, HEAP_BITS, LEAF_SIZE, Heap
+from mitsuba_ext.scene.lightweight.mesh_geometry import MeshGeometry
+from mitsuba_ext.scene.lightweight.mesh_tree import MeshTree, _boxes
+from mitsuba_ext.scene.lightweight.nodes import MIN_EXPONENT
+from mitsuba_ext.scene.lightweight.packed_mesh import PackedMesh
+from mitsuba_ext.scene.lightweight.traversal import NONE
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,7 +12,7 @@ from scipy import stats
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
 from techniques import REFERENCE
 
-from mitsuba_ext.decisions.next_event.linear_lights import LinearChoice
+from mitsuba_ext.techniques.linear_lights.linear_lights import LinearChoice
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.walk import Walk
 

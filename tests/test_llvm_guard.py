@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext.errors import InstallationError
 from mitsuba_ext.startup import llvm, llvm_install, runtime
+from mitsuba_ext.util.errors import InstallationError
 
 ROOT = Path(__file__).parents[1]
 

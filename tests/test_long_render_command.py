@@ -20,11 +20,11 @@ import pytest
 from conftest import PATH, in_subprocess
 
 from mitsuba_ext.compare import load_reference, read_exr
-from mitsuba_ext.errors import InputError
 from mitsuba_ext.images import image_files
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
+from mitsuba_ext.util.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
 

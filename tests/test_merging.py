@@ -14,15 +14,15 @@ from stage import area, bitmap, film, lookat, sensor, stage
 from statistical import assert_same_mean, batches, load, some
 from test_furnace import FURNACES
 
-from mitsuba_ext.bidirectional.merging import median_footprint
-from mitsuba_ext.bidirectional.merging_radius import MergingRadius
-from mitsuba_ext.bidirectional.vertex_grid import VertexGrid
-from mitsuba_ext.composition import merging_parameters
-from mitsuba_ext.decisions.camera.shared_numbers import (
+from mitsuba_ext.estimators.light_paths.merging import merging_parameters
+from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
+from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
+from mitsuba_ext.estimators.light_paths.merging.shared_numbers import (
     TIME_STEP,
     WAVELENGTH_STEP,
     SharedNumbers,
 )
+from mitsuba_ext.estimators.light_paths.merging.vertex_grid import VertexGrid
 from mitsuba_ext.transport.scene_query import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")

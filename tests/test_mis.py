@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from statistical import batches, load
 
-from mitsuba_ext.composition.mis import HEURISTICS
+from mitsuba_ext.techniques.mis.parameters import HEURISTICS
 from mitsuba_ext.transport.mis import (
     cutoff_heuristic_of,
     maximum_heuristic,

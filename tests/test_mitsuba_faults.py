@@ -111,10 +111,10 @@ def test_each_section_claims_something_wrong_and_links_to_files_that_exist() -> 
 
 
 def test_failures_distinguish_a_fixed_fault_from_a_changed_one() -> None:
-    files = ["mitsuba_ext/materials/glass.py"]
+    files = ["mitsuba_ext/transport/materials/glass.py"]
     fault = Fault("Dark glass", 7, "x = 1\nprint(x)  # 0.4 ± 0.01, not 0.5\n", files, False)
     fault.judge(8, 0.405)
-    where = 'section "Dark glass".*mitsuba_ext/materials/glass.py'
+    where = 'section "Dark glass".*mitsuba_ext/transport/materials/glass.py'
     with pytest.raises(pytest.fail.Exception, match=where):
         fault.judge(8, 0.499)
     with pytest.raises(pytest.fail.Exception, match="changed: .* says 0.4, and it is 0.3"):

@@ -23,15 +23,15 @@ from statistical import (
 from test_bidirectional_weights import SPECULAR
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
 
-from mitsuba_ext.composition import path_mutations
-from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.metropolis.chains.numbers import ProposedNumbers, StateNumbers, generator
-from mitsuba_ext.metropolis.chains.path_target import PathTarget
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
-from mitsuba_ext.metropolis.path_space.evaluation import _lobe_ratio
-from mitsuba_ext.metropolis.path_space.mutations import Mutations, Switches
-from mitsuba_ext.metropolis.path_space.space import PathSpace, turned
-from mitsuba_ext.metropolis.path_space.techniques import Techniques
+from mitsuba_ext.bases import path_mutations
+from mitsuba_ext.estimators.chains.numbers import ProposedNumbers, StateNumbers, generator
+from mitsuba_ext.estimators.chains.path_space.evaluation import _lobe_ratio
+from mitsuba_ext.estimators.chains.path_space.mutations import Mutations, Switches
+from mitsuba_ext.estimators.chains.path_space.space import PathSpace, turned
+from mitsuba_ext.estimators.chains.path_space.techniques import Techniques
+from mitsuba_ext.estimators.chains.path_target import PathTarget
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.light_paths.light_side import LightSide
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")

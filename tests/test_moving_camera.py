@@ -21,9 +21,9 @@ from statistical import (
 )
 from techniques import REFERENCE, TECHNIQUES
 
-from mitsuba_ext.decisions.query.scene import scene_query
 from mitsuba_ext.scene.movers import is_moving_camera
 from mitsuba_ext.transport.path_decisions import SceneQuery
+from mitsuba_ext.transport.queries.scene import scene_query
 
 Scene = dict[str, Any]
 

@@ -22,8 +22,8 @@ from statistical import (
 )
 from techniques import REFERENCE, TECHNIQUES
 
-from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.query.scene import scene_query
+from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.transport.queries.scene import scene_query
 
 Scene = dict[str, Any]
 

@@ -10,8 +10,8 @@ import pytest
 from hard_cases import area, diffuse, film, sensor
 
 from mitsuba_ext.compare.timing import timed_render
-from mitsuba_ext.decisions.query.scene import scene_query
 from mitsuba_ext.scene.movers import refuse_movers
+from mitsuba_ext.transport.queries.scene import scene_query
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -14,11 +14,11 @@ from statistical import assert_images_are_sound, batches
 from test_chains import _found, _Histogram, _Target
 from test_erpt import _GLASS, erpt
 
-from mitsuba_ext.metropolis.chains.bootstrap import Bootstrap
-from mitsuba_ext.metropolis.chains.chains import ChainRules
-from mitsuba_ext.metropolis.chains.noise_filters import FilteredChains, FilteredImage, NoiseFilters
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
-from mitsuba_ext.metropolis.chains.target import Contribution
+from mitsuba_ext.estimators.chains.bootstrap import Bootstrap
+from mitsuba_ext.estimators.chains.chains import ChainRules
+from mitsuba_ext.estimators.chains.noise_filters import FilteredChains, FilteredImage, NoiseFilters
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.chains.target import Contribution
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,11 +13,11 @@ import pytest
 from hard_cases import diffuse, rectangle, stage
 from scipy import stats
 
-from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
-from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.lights.weights import power_weights
+from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.weights import power_weights
 from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.light_table import LightTable, OneRow
 from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers, hashed, hashed_2d
 from mitsuba_ext.transport.path_decisions import DirectionSamples, Roulette, ShadowTest
 from mitsuba_ext.transport.walk import Walk

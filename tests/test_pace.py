@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from stage import area, stage
 
-from mitsuba_ext.arrays import add_own, channel_mean
-from mitsuba_ext.composition import light_path_schedule
+from mitsuba_ext.bases import light_path_schedule
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.stages import EndingSchedule
+from mitsuba_ext.util.arrays import add_own, channel_mean
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext.composition.slots import SLOTS
+from mitsuba_ext.bases.slots import SLOTS
 from mitsuba_ext.inputs.specifications import make_named
 from mitsuba_ext.startup import pages, registry
 

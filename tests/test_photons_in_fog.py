@@ -12,8 +12,8 @@ from fogs import camera, cube, fog, fog_around_the_camera, grid, homogeneous
 from stage import area, diffuse, lookat, sensor
 from statistical import assert_images_are_sound, assert_same_quarters, batches, some
 
-from mitsuba_ext.bidirectional.light_media import outer_medium
-from mitsuba_ext.bidirectional.merging_radius import MergingRadius
+from mitsuba_ext.estimators.light_paths.light_media import outer_medium
+from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from statistical import load
 
-from mitsuba_ext.composition.pixel_maps import light_probabilities, pixel_maps
-from mitsuba_ext.decisions.swarm.mapped_lights import light_cells
-from mitsuba_ext.decisions.swarm.mapped_lobes import lobe_cells
-from mitsuba_ext.learning.swarm.camera_map_learner import CameraMapLearner
-from mitsuba_ext.learning.swarm.light_numbers_learner import LightNumbersLearner
-from mitsuba_ext.learning.swarm.lobe_map_learner import LobeMapLearner
-from mitsuba_ext.maps.swarm.cells import Cells
+from mitsuba_ext.techniques.swarming.camera_map_learner import CameraMapLearner
+from mitsuba_ext.techniques.swarming.cells import Cells
+from mitsuba_ext.techniques.swarming.light_numbers_learner import LightNumbersLearner
+from mitsuba_ext.techniques.swarming.lobe_map_learner import LobeMapLearner
+from mitsuba_ext.techniques.swarming.mapped_lights import light_cells
+from mitsuba_ext.techniques.swarming.mapped_lobes import lobe_cells
+from mitsuba_ext.techniques.swarming.pixel_maps import light_probabilities, pixel_maps
 
 pytestmark = pytest.mark.usefixtures("variant")
 

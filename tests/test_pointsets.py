@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from mitsuba_ext.pointsets import (
+from mitsuba_ext.util.pointsets import (
     PATTERNS,
     correction,
     nearest_neighbour_weights,

@@ -13,9 +13,9 @@ from stage import area, diffuse, film, lookat, rectangle, rgb, sensor
 from statistical import assert_images_are_sound, assert_same_mean, batches
 from test_environment_bins import MORE_ENVIRONMENTS, _square
 
-from mitsuba_ext.decisions.next_event.portal_sampling import PortalSampling
-from mitsuba_ext.lights.portal_maps import PortalMaps
 from mitsuba_ext.scene.portals import Portal, portals
+from mitsuba_ext.techniques.portal_lights.portal_maps import PortalMaps
+from mitsuba_ext.techniques.portal_lights.portal_sampling import PortalSampling
 from mitsuba_ext.transport.path_decisions import LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from statistical import load
 
-from mitsuba_ext.bidirectional.candidates import Candidate
-from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
-from mitsuba_ext.composition import light_paths
-from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
-from mitsuba_ext.composition.light_paths import LightPathChoice, LightPathTrial
-from mitsuba_ext.composition.predicted_errors import PredictedErrors
-from mitsuba_ext.composition.promise import Promise
+from mitsuba_ext.bases.light_path_schedule import LightPathSchedule
+from mitsuba_ext.estimators.light_paths.choice import light_paths
+from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
+from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathChoice, LightPathTrial
+from mitsuba_ext.estimators.light_paths.choice.predicted_errors import PredictedErrors
+from mitsuba_ext.estimators.light_paths.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.images.coarse_film import CoarseFilm
-from mitsuba_ext.learning.directions.guide_learner import GuideLearner
-from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
+from mitsuba_ext.planning.promise import Promise
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
 from mitsuba_ext.rendering.stages import Stage
+from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
+from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -29,8 +29,8 @@ from techniques import REFERENCE, TECHNIQUES
 from test_light_tracer import T, below_the_lamp
 from test_rendering import _Clock
 
-from mitsuba_ext.metropolis.chains import visits
-from mitsuba_ext.metropolis.chains.looped import LoopedChains
+from mitsuba_ext.estimators.chains import visits
+from mitsuba_ext.estimators.chains.looped import LoopedChains
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -174,7 +174,7 @@ def test_a_film_that_takes_no_light_of_chains_is_refused(variant: str) -> None:
 @pytest.fixture
 def small_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sixteen mutations per pixel: four of each chain."""
-    monkeypatch.setattr("mitsuba_ext.metropolis.chains.looped.LoopedChains.launch", 4)
+    monkeypatch.setattr("mitsuba_ext.estimators.chains.looped.LoopedChains.launch", 4)
 
 
 #: 64 mutations per pixel are then 16 of each chain.
@@ -197,7 +197,7 @@ def test_a_seed_gives_one_image() -> None:
 def test_launches_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_dict(stage())
     (in_four,) = batches(scene, pssmlt(**_FOUR_PER_PIXEL), 64, [3])
-    monkeypatch.setattr("mitsuba_ext.metropolis.chains.looped.LoopedChains.launch", 16)
+    monkeypatch.setattr("mitsuba_ext.estimators.chains.looped.LoopedChains.launch", 16)
     (in_one,) = batches(scene, pssmlt(**_FOUR_PER_PIXEL), 64, [3])
     _assert_same_seed(in_four, in_one)
 

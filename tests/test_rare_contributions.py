@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_ext.bidirectional.path_moments import Estimate
-from mitsuba_ext.bidirectional.rare_contributions import BINS, error_of_render, rare
-from mitsuba_ext.composition.predicted_errors import PredictedErrors
+from mitsuba_ext.estimators.light_paths.choice.path_moments import Estimate
+from mitsuba_ext.estimators.light_paths.choice.predicted_errors import PredictedErrors
+from mitsuba_ext.estimators.light_paths.choice.rare_contributions import BINS, error_of_render, rare
 from mitsuba_ext.images.coarse_film import CoarseFilm
 
 #: Pixels of a row, and pixels.

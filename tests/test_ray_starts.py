@@ -10,7 +10,7 @@ import pytest
 from stage import area, diffuse, film, lookat, sensor, stage
 from statistical import batches, some
 
-from mitsuba_ext.decisions.query.scene import scene_query
+from mitsuba_ext.transport.queries.scene import scene_query
 from mitsuba_ext.transport.ray_starts import RayStarts, ray_starts
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -10,7 +10,7 @@ from maps import lamp
 from statistical import two_halves
 from techniques import TECHNIQUES
 
-from mitsuba_ext.decisions.next_event.resampled_lights import ResampledLights
+from mitsuba_ext.techniques.resampled_lights.resampled_lights import ResampledLights
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -20,10 +20,10 @@ from statistical import (
 )
 from techniques import TECHNIQUES
 
-from mitsuba_ext.decisions.roulette.adjoint_roulette import AdjointRoulette
-from mitsuba_ext.learning.directions.roulette_trial import Effect, RouletteTrial
-from mitsuba_ext.learning.directions.surface_regions import SurfaceRegions
-from mitsuba_ext.learning.pixel_estimates import PixelEstimates
+from mitsuba_ext.planning.pixel_estimates import PixelEstimates
+from mitsuba_ext.techniques.guided_directions.adjoint_roulette import AdjointRoulette
+from mitsuba_ext.techniques.guided_directions.roulette_trial import Effect, RouletteTrial
+from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
 from mitsuba_ext.transport.path_decisions import Roulette
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from statistical import THRESHOLD, sidak
 
-from mitsuba_ext.maps.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.techniques.guided_directions.sample_trees import LEAF, SampleTrees
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -82,7 +82,7 @@ def test_points_of_faure_are_a_net_in_any_two_dimensions(dimensions: int) -> Non
 
 
 def test_direction_numbers_are_those_of_scipy() -> None:
-    from mitsuba_ext.sequences.sobol import _direction_numbers
+    from mitsuba_ext.util.sequences.sobol import _direction_numbers
 
     columns = _direction_numbers(8)
     theirs = stats.qmc.Sobol(8, scramble=False, bits=32).random(1024)
@@ -227,7 +227,7 @@ def test_bad_parameters_are_named(parameters: dict[str, Any], what: str) -> None
 
 def test_many_samples_of_halton_have_an_interval_each() -> None:
     """With 2^30 samples, powers of the bases have more than 32 bits."""
-    from mitsuba_ext.sequences.halton import Halton
+    from mitsuba_ext.util.sequences.halton import Halton
 
     point = dr.arange(mi.UInt32, 19**2) + 2**30 - 19**2
     x = Halton(8).coordinate(point, 2**30, mi.UInt32(7), dr.full(mi.UInt32, 5, 19**2))

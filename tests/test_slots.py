@@ -13,7 +13,7 @@ import pytest
 from hard_cases import film, sensor, stage
 from statistical import batches, one_thread
 
-from mitsuba_ext.composition.slots import SLOTS as WORDS
+from mitsuba_ext.bases.slots import SLOTS as WORDS
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from statistical import THRESHOLD
 
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
+from mitsuba_ext.estimators.chains.small_steps import SmallSteps
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -9,11 +9,11 @@ import pytest
 from conftest import PATH
 
 from mitsuba_ext.compare import InputError, load_scene
-from mitsuba_ext.errors import one_line
 from mitsuba_ext.inputs.plugin_text import parse_plugin
 from mitsuba_ext.inputs.specifications import make_named
 from mitsuba_ext.inputs.variants import _import_module as import_plugin
-from mitsuba_ext.rendering.aovs import AOV_TYPES
+from mitsuba_ext.scene.aovs import AOV_TYPES
+from mitsuba_ext.util.errors import one_line
 
 import mitsuba as mi  # isort: skip
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hard_cases import diffuse
 
-from mitsuba_ext.bidirectional.stored_interaction import (
+from mitsuba_ext.estimators.light_paths.stored_interaction import (
     from_words,
     interaction_words,
     needs_whole_interaction,

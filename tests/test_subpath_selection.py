@@ -14,15 +14,15 @@ from statistical import SEEDS, batches, load, some
 from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import T, below_the_lamp
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_vertices import PackedVertices, VertexCache
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.partial_sums import PartialSums, Sums
-from mitsuba_ext.bidirectional.vertex_choice import RegionChoice
-from mitsuba_ext.decisions.subpaths.region_table import RegionTable
-from mitsuba_ext.learning.subpaths import region_learner
-from mitsuba_ext.regions.nested_regions import NestedRegions
-from mitsuba_ext.regions.surface_sides import lit_normal
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_vertices import PackedVertices, VertexCache
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
+from mitsuba_ext.estimators.light_paths.subpath_choice import region_learner
+from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
+from mitsuba_ext.estimators.light_paths.vertex_choice import RegionChoice
+from mitsuba_ext.scene.regions.nested_regions import NestedRegions
+from mitsuba_ext.scene.regions.surface_sides import lit_normal
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 

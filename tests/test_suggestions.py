@@ -7,8 +7,8 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from mitsuba_ext.errors import one_line
 from mitsuba_ext.inputs.names import MITSUBA_INTEGRATORS
+from mitsuba_ext.util.errors import one_line
 
 pytestmark = pytest.mark.usefixtures("variant")
 

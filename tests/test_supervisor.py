@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import marks
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import InputError
 from mitsuba_ext.rendering import interrupts
+from mitsuba_ext.util import marks
 
 #: Code before the lines of each worker. A restarted worker runs the same lines.
 WORKER = """

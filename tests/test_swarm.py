@@ -11,11 +11,11 @@ import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor, stage
 from statistical import assert_exact, assert_same_pixels_on_average, batches, load, one_thread
 
-from mitsuba_ext.composition import swarm as swarm_parameters
-from mitsuba_ext.decisions.swarm.bounce_records import BounceRecords
-from mitsuba_ext.decisions.swarm.mapped_lights import light_cells
-from mitsuba_ext.decisions.swarm.mapped_lobes import path_density
-from mitsuba_ext.learning.swarm import map_learner
+from mitsuba_ext.techniques.swarming import map_learner
+from mitsuba_ext.techniques.swarming import parameters as swarm_parameters
+from mitsuba_ext.techniques.swarming.bounce_records import BounceRecords
+from mitsuba_ext.techniques.swarming.mapped_lights import light_cells
+from mitsuba_ext.techniques.swarming.mapped_lobes import path_density
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -7,12 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
-from mitsuba_ext.learning.swarm.estimate import Form, Grid, Shares, estimate
-from mitsuba_ext.learning.swarm.tile_counts import Choices, TileCounts
-from mitsuba_ext.maps.swarm.cells import CellDensities, Cells
-from mitsuba_ext.maps.swarm.film_tiles import FilmTiles
 from mitsuba_ext.rendering.dither import dithered_parts
+from mitsuba_ext.techniques.swarming.cells import CellDensities, Cells
+from mitsuba_ext.techniques.swarming.estimate import Form, Grid, Shares, estimate
+from mitsuba_ext.techniques.swarming.film_tiles import FilmTiles
+from mitsuba_ext.techniques.swarming.parameters import doubling_pilots, stage_weights
+from mitsuba_ext.techniques.swarming.tile_counts import Choices, TileCounts
 
 pytestmark = pytest.mark.usefixtures("variant")
 

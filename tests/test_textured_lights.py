@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from statistical import assert_same_pixels_on_average, batches
 
-from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.light_cells import LightCells
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -7,14 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.learning.directions.tree_builder import (
+from mitsuba_ext.techniques.guided_directions.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.techniques.guided_directions.tree_builder import (
     DEPTH,
     Samples,
     TreeBuilder,
     cell_centre,
     cell_code,
 )  # fmt: skip
-from mitsuba_ext.maps.sample_trees import LEAF, SampleTrees
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,11 +12,11 @@ from scipy import stats
 from statistical import batches, load, one_thread, some
 from test_environment_bins import MORE_ENVIRONMENTS, SPOTS, _square
 
-from mitsuba_ext.decisions.next_event.environment_partition import Partitioner
-from mitsuba_ext.decisions.next_event.two_stage import TwoStage
-from mitsuba_ext.lights.environment_texels import EnvironmentTexels
-from mitsuba_ext.lights.spectra import brightness
-from mitsuba_ext.lights.texel_sums import Corners, TexelSums
+from mitsuba_ext.scene.lights.environment_texels import EnvironmentTexels
+from mitsuba_ext.scene.lights.spectra import brightness
+from mitsuba_ext.scene.lights.texel_sums import Corners, TexelSums
+from mitsuba_ext.techniques.two_stage_lights.environment_partition import Partitioner
+from mitsuba_ext.techniques.two_stage_lights.two_stage import TwoStage
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from statistical import load, one_thread
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_vertices import LightVertices, PackedVertices, VertexCache
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.partial_sums import PartialSums
+from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_vertices import (
+    LightVertices,
+    PackedVertices,
+    VertexCache,
+)
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -7,10 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.decisions.shadow_test.visibility_roulette import VisibilityRoulette
-from mitsuba_ext.learning.shadow_test.visibility_roulette_learner import VisibilityRouletteLearner
-from mitsuba_ext.maps.visibility_map import MAX_VOXELS, VisibilityMap, _row_and_column
-from mitsuba_ext.regions.voxel_grid import VoxelGrid
+from mitsuba_ext.scene.regions.voxel_grid import VoxelGrid
+from mitsuba_ext.techniques.shadow_rejection.visibility_map import (
+    MAX_VOXELS,
+    VisibilityMap,
+    _row_and_column,
+)
+from mitsuba_ext.techniques.shadow_rejection.visibility_roulette import VisibilityRoulette
+from mitsuba_ext.techniques.shadow_rejection.visibility_roulette_learner import (
+    VisibilityRouletteLearner,
+)
 from mitsuba_ext.transport.estimator import CameraRays
 
 pytestmark = pytest.mark.usefixtures("variant")

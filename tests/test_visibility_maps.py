@@ -15,12 +15,16 @@ from statistical import assert_images_are_sound, assert_same_mean, batches, one_
 from test_environment_bins import _square
 from test_two_stage import LANES, _everywhere, _scene, _vertex
 
-from mitsuba_ext.decisions.next_event.two_stage import TwoStage
-from mitsuba_ext.learning.next_event.environment_visibility_learner import VisibilityLearner
-from mitsuba_ext.maps.environment_visibility import PrimaryVisibility, Tile, VisibilityCounts
 from mitsuba_ext.rendering.render import kernel_cache_misses
-from mitsuba_ext.stored.arrays import StoredArrays
+from mitsuba_ext.techniques.two_stage_lights.environment_visibility import (
+    PrimaryVisibility,
+    Tile,
+    VisibilityCounts,
+)
+from mitsuba_ext.techniques.two_stage_lights.learner import VisibilityLearner
+from mitsuba_ext.techniques.two_stage_lights.two_stage import TwoStage
 from mitsuba_ext.transport.path_decisions import LightNumbers
+from mitsuba_ext.util.stored_arrays import StoredArrays
 
 pytestmark = pytest.mark.usefixtures("variant")
 

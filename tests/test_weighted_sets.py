@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.maps.weighted_sets import WEIGHTS, WeightedSets
-from mitsuba_ext.pointsets import PATTERNS, voronoi_weights
+from mitsuba_ext.techniques.weighted_points.weighted_sets import WEIGHTS, WeightedSets
+from mitsuba_ext.util.pointsets import PATTERNS, voronoi_weights
 
 pytestmark = pytest.mark.usefixtures("variant")
 

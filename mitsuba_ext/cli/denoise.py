@@ -21,10 +21,10 @@ def denoise(image: Path, output: Path | None) -> int:
     It is guided by the layers of an EXR whose names end with "albedo" and "normal", such as those
     of --integrator "aov:aovs=albedo:albedo,normal:sh_normal,img=[path]".
     """
-    from ..errors import InputError
     from ..images import image_files
     from ..images.denoising import denoise_file, denoiser
     from ..inputs.variants import select_variant
+    from ..util.errors import InputError
 
     target = output or image.with_name(f"{image.stem}.denoised{image.suffix}")
     if target.exists() and target.samefile(image):

@@ -99,8 +99,8 @@ class _Difference:
 
 
 def _read(path: Path) -> _Image:
-    from ..errors import InputError
     from ..images import metrics, reading
+    from ..util.errors import InputError
 
     pixels, variance, metadata = reading.read_image(path)
     for name, values in (("", pixels), ("variance: ", variance)):
@@ -113,8 +113,8 @@ def _read(path: Path) -> _Image:
 def _compare(image: _Image, reference: _Image) -> _Difference:
     import numpy as np
 
-    from ..errors import InputError
     from ..images import metrics
+    from ..util.errors import InputError
 
     if image.size != reference.size:
         raise InputError(

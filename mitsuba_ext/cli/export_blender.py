@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import InputError
-from ..files import check_target, replacing
+from ..util.errors import InputError
+from ..util.files import check_target, replacing
 from .common import say
 
 if TYPE_CHECKING:

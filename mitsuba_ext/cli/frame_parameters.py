@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import InputError
 from ..inputs.variants import import_from_here
+from ..util.errors import InputError
 
 
 class FrameParameters(NamedTuple):

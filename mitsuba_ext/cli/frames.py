@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from ..errors import InputError
+from ..util.errors import InputError
 from .common import MAX_SEED
 
 #: The functions and constants of expressions, besides the number of the frame.

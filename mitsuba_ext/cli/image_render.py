@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import marks
-from ..composition.guides import render_guides
 from ..images import denoising, image_files
 from ..inputs.chosen import LastScene
 from ..inputs.scene_changes import SceneChanges
 from ..inputs.variants import select_variant
 from ..long_renders.batch_renderer import RenderRequest
 from ..long_renders.folder import CheckpointFolder
+from ..rendering.scene_guides import render_guides
 from ..startup import machine
+from ..util import marks
 from . import statistics
 from .common import kernels_compiled, say
 from .frame_parameters import FrameParameters

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
 from ..inputs.chosen import LastScene
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
@@ -25,6 +24,7 @@ from ..rendering import interrupts
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
+from ..util.errors import InputError
 from .long_progress import LongProgress
 from .reports import Report
 

@@ -31,9 +31,9 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     """Merge the samples of renders that 'mitsuba-ext render --checkpoint DIR' has saved: of the
     same scene, by the same integrator, with different seeds. Each render is weighted by its
     samples."""
-    from ..errors import InputError
-    from ..files import make_folder
     from ..long_renders.folder import CheckpointFolder, check_same
+    from ..util.errors import InputError
+    from ..util.files import make_folder
 
     if len(folders) < 2:
         raise click.UsageError("there is nothing to merge with: name two folders or more")

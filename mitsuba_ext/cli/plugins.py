@@ -51,8 +51,8 @@ def list_plugins(name: str | None) -> int:
 
 
 def _no_page(name: str, ours: list[str]) -> click.UsageError:
-    from ..errors import did_you_mean
     from ..inputs import names
+    from ..util.errors import did_you_mean
 
     if name in names.MITSUBA_INTEGRATORS:
         return click.UsageError(

@@ -13,8 +13,8 @@ from ..inputs.names import check_integrator
 from ..inputs.scene_changes import SceneChanges
 from ..inputs.variants import select_variant
 from ..long_renders.intervals import Interval
-from ..parameters import MOST_SPP
 from ..rendering.interrupts import requests_to_keep
+from ..util.parameters import MOST_SPP
 from . import candidates
 from .common import (
     MAX_SEED,

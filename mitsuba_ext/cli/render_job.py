@@ -12,11 +12,11 @@ import numpy as np
 from rich.progress import Progress
 
 from ..compare import timing
-from ..errors import InputError, one_line
 from ..inputs.chosen import Chosen
 from ..rendering.batches import sample_count
 from ..rendering.seed_passes import SeedPasses, can_render, is_independent
 from ..rendering.totals import RenderTotals, forget_memory_peak
+from ..util.errors import InputError, one_line
 from .reports import Report, Speed, time_left
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import click
 from rich.progress import Progress, TextColumn
 
-from ..progress import progress_bars
+from ..compare.progress import progress_bars
 from .common import say
 
 #: Smallest number of seconds between two events of progress.

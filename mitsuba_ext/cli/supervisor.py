@@ -26,9 +26,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .. import marks
 from ..rendering import interrupts
 from ..startup.processes import python_command
+from ..util import marks
 from .common import INTERRUPTED, say
 
 #: Value of the click context's ``obj`` in a process that was started from a shell.

@@ -17,7 +17,6 @@
 
 from __future__ import annotations
 
-from ..errors import InputError
 from ..images.flip import mean_flip
 from ..images.image_files import read_exr, write_exr
 from ..images.metrics import Errors, errors, reference_noise, relative_mse
@@ -25,13 +24,14 @@ from ..images.reading import read_image
 from ..inputs.scene_changes import SceneChanges
 from ..inputs.scenes import LoadedScene, load_scene
 from ..inputs.specifications import NamedIntegrator, make_named
-from ..progress import Step
+from ..util.errors import InputError
 from .budgets import Budget, equal_samples, equal_time, sweep, until
 from .comparison import Comparison, SceneSetup
 from .contenders import Contender
 from .experiment import Experiment
 from .intervals import Estimate
 from .notebook import Results
+from .progress import Step
 from .references import Reference, load_reference, render_reference
 from .report import write_report
 from .runs import Run

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from numbers import Real
 
-from ..errors import InputError
+from ..util.errors import InputError
 
 #: Samples per pixel that ``until`` starts with. With fewer, an integrator may have no pilot pass.
 _FIRST_SPP = 8

@@ -16,21 +16,21 @@ from typing import TYPE_CHECKING, Any, Union
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import InputError
-from ..files import replacing
 from ..images import image_files
 from ..inputs.scene_changes import UNCHANGED, SceneChanges
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, check_source, load_scene, scene_name
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
-from ..marks import REFERENCES, in_use
-from ..progress import Step, reporting
 from ..startup.machine import machine, versions
+from ..util.errors import InputError
+from ..util.files import replacing
+from ..util.marks import REFERENCES, in_use
 from . import references, results, timing
 from .budgets import Budget
 from .contenders import make_all
 from .experiment import Experiment
 from .notebook import Results
+from .progress import Step, reporting
 from .reference_choice import choose_integrator
 from .references import Reference
 from .report import write_report

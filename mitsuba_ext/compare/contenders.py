@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..errors import InputError
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..scene.nesting import with_nested
+from ..util.errors import InputError
 from .runs import Run
 
 

@@ -21,17 +21,17 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from ..errors import one_line
 from ..images import image_files, metrics
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene
 from ..inputs.specifications import Specification
-from ..marks import has_crashed, mark_of, marked, renew
-from ..progress import Step
 from ..startup.machine import machine, versions
+from ..util.errors import one_line
+from ..util.marks import has_crashed, mark_of, marked, renew
 from . import timing
 from .budgets import Budget
 from .contenders import Contender, make_all
+from .progress import Step
 from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import mitsuba as mi
 
-from ..bidirectional.emission import LightEmission
-from ..bidirectional.sensor import ConnectableSensor
+from ..estimators.light_paths.emission import LightEmission
+from ..estimators.light_paths.sensor import ConnectableSensor
 from ..inputs.scenes import LoadedScene
 from ..rendering.camera import check_takes_splats
 from ..scene.media import extinction_varies

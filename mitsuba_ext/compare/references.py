@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, one_line
-from ..files import replacing
 from ..images import image_files, metrics
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, scene_name
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
-from ..marks import mark_of, marked
 from ..rendering.batches import Batches, batch_seeds, each_batch
 from ..startup.machine import versions
+from ..util.errors import InputError, one_line
+from ..util.files import replacing
+from ..util.marks import mark_of, marked
 from .reference_choice import choose_integrator
 
 if TYPE_CHECKING:

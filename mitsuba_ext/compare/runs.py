@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import marks
-from ..errors import InputError
-from ..files import replacing
 from ..images import image_files
 from ..images.metrics import Errors
+from ..util import marks
+from ..util.errors import InputError
+from ..util.files import replacing
 
 #: Suffix of the file with a run's times in other sessions.
 _TIMES = ".times.json"

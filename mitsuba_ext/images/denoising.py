@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, InstallationError
+from ..util.errors import InputError, InstallationError
 from . import image_files, reading
 
 if TYPE_CHECKING:

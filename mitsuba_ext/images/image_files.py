@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import files
-from ..errors import InputError, one_line
-from ..files import replacing
 from ..startup.machine import memory_bytes
+from ..util import files
+from ..util.errors import InputError, one_line
+from ..util.files import replacing
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..util.errors import InputError
 from . import image_files
 
 Channels = Mapping[str, np.ndarray]

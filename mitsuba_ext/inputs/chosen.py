@@ -9,8 +9,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import InputError
 from ..startup.runtime import SUPPORTED_VARIANTS
+from ..util.errors import InputError
 from .content_hash import hash_code
 from .names import OF_SCENE
 from .scene_changes import UNCHANGED, SceneChanges

@@ -14,8 +14,8 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, did_you_mean
 from ..startup import plugin_parameters, registry
+from ..util.errors import InputError, did_you_mean
 from .plugin_text import parse_plugin
 
 _SAMPLING = ("block_size", "hide_emitters", "samples_per_pass", "timeout")

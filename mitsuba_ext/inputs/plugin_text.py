@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from itertools import accumulate
 from typing import Any
 
-from ..errors import InputError
+from ..util.errors import InputError
 
 
 def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:

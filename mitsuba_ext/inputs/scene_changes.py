@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..errors import InputError, one_line
+from ..util.errors import InputError, one_line
 from .plugin_text import parse_plugin
 
 if TYPE_CHECKING:

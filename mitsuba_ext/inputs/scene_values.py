@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError, did_you_mean, one_line
+from ..util.errors import InputError, did_you_mean, one_line
 
 
 def as_text(values: Mapping[str, Any]) -> str:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, did_you_mean, one_line
-from ..files import is_utf8, printable
-from ..rendering.aovs import check_nodes
+from ..scene.aovs import check_nodes
+from ..util.errors import InputError, did_you_mean, one_line
+from ..util.files import is_utf8, printable
 from .content_hash import hash_each, hash_files
 from .names import explained
 from .parsed_scene import check_parsed

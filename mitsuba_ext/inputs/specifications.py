@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
 from xml.etree import ElementTree
 
-from ..errors import InputError, one_line
-from ..rendering.aovs import check_aovs, check_nodes
+from ..scene.aovs import check_aovs, check_nodes
 from ..startup.plugin_parameters import parameter_names
 from ..startup.registry import plugin_names
+from ..util.errors import InputError, one_line
 from .content_hash import hash_code, hash_value
 from .names import explained, is_file_of_mitsuba, is_plugin, unknown_parameter, unknown_plugin
 from .plugin_text import parse_plugin

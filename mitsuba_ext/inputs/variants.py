@@ -11,15 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-from ..errors import InputError, did_you_mean
 from ..startup.signals import signals_wait
+from ..util.errors import InputError, did_you_mean
 
 
 def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
     """Selects a variant, then imports the modules, whose classes are bound to the variant."""
     import mitsuba as mi
 
-    from ..errors import one_line
+    from ..util.errors import one_line
 
     if variant not in mi.variants():
         known = mi.variants()

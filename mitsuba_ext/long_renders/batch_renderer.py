@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, one_line
 from ..inputs.chosen import LastScene
 from ..inputs.scene_changes import UNCHANGED, SceneChanges
 from ..scene.nesting import with_nested
 from ..startup.machine import versions
+from ..util.errors import InputError, one_line
 from .bundle import Bundle
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult

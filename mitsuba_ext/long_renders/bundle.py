@@ -12,10 +12,10 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import InputError
 from ..inputs.content_hash import hash_each
 from ..inputs.scene_files import named_by_absolute_path
 from ..inputs.scenes import LoadedScene
+from ..util.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, InstallationError
+from ..util.errors import InputError, InstallationError
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..util.errors import InputError
 from .batch_renderer import BatchRenderer, RenderRequest
 from .bundle import Bundle
 from .state import Batch, BatchResult

@@ -7,10 +7,10 @@ from concurrent.futures import Executor
 
 import mitsuba as mi
 
-from ..errors import InputError
 from ..inputs.chosen import Chosen, LastScene
 from ..inputs.scenes import LoadedScene
 from ..rendering.batches import Batches
+from ..util.errors import InputError
 from .batch_renderer import BatchRenderer, RenderRequest
 from .dispatch import Dispatch
 from .state import Batch

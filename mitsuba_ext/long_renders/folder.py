@@ -12,11 +12,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .. import marks
-from ..errors import InputError
-from ..files import make_folder, replacing
-from ..stored import archives
-from ..stored.arrays import DamagedError
+from ..util import archives, marks
+from ..util.errors import InputError
+from ..util.files import make_folder, replacing
+from ..util.stored_arrays import DamagedError
 from .state import RenderState
 
 #: Files: the description of what is rendered; the state; the state before it.

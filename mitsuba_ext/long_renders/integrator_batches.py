@@ -11,12 +11,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
 from ..rendering.batches import batch_seeds, each_batch, sample_count
 from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
 from ..rendering.seed_passes import can_render, is_independent, pass_length
 from ..rendering.totals import RenderTotals, forget_memory_peak
+from ..util.errors import InputError
 from .state import Batch, BatchResult, image_shape
 
 #: Approximate number of samples in a batch of one of our integrators. Batches are this large

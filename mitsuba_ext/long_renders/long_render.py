@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from ..errors import InputError
 from ..images import image_files
+from ..util.errors import InputError
 from .announced_error import announced_error
 from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
 from ..rendering.totals import RenderTotals
-from ..stored.arrays import StoredArrays
+from ..util.errors import InputError
+from ..util.stored_arrays import StoredArrays
 
 
 class Batch(NamedTuple):

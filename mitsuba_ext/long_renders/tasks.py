@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import drjit as dr
 
-from ..errors import InputError
 from ..inputs.variants import select_variant
+from ..util.errors import InputError
 from .batch_renderer import BatchRenderer, RenderRequest
 from .bundle import Bundle
 from .folder import difference

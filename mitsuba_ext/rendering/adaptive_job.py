@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import channel_mean, from_numpy
+from ..util.arrays import channel_mean, from_numpy
 from . import camera
 from .pixel_moments import PixelMoments
 from .render import Job, kernel_cache_misses, kernels_compiled

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
-from ..stored.arrays import StoredArrays
+from ..util.stored_arrays import StoredArrays
 from .camera import film_told, find_sensor
 
 #: What is wrong with a sampler that has no samples.

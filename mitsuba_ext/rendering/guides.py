@@ -7,10 +7,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import channel_mean
 from ..transport.bsdfs import sample_bsdf
 from ..transport.estimator import Sample
 from ..transport.path_decisions import SceneQuery
+from ..util.arrays import channel_mean
 from . import camera
 from .camera_samples import CameraSamples
 from .plan import check_extent

@@ -10,7 +10,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..parameters import MOST_SPP
+from ..util.parameters import MOST_SPP
 from .batches import NO_SAMPLES
 from .camera import film_extent
 

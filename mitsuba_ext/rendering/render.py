@@ -18,11 +18,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
 from ..scene.gradients import has_gradients
 from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import with_recordings
+from ..util.arrays import from_numpy
 from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats

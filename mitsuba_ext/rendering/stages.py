@@ -22,7 +22,7 @@ class Stage:
         estimator: Takes the samples of the stage.
         learned: A summary of what the integrator has learned from earlier stages.
         effects: The effects of learned decisions, by slot
-            (:meth:`mitsuba_ext.learning.effect.Effect.as_dict`).
+            (:meth:`mitsuba_ext.planning.effect.Effect.as_dict`).
         is_scout: Does it take one sample per pixel that is not added to the film?
         pixels: Of a scout: the pixel of each sample; ``None`` for one sample of each pixel.
         camera: Chooses points of the aperture, times and wavelengths.

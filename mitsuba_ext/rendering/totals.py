@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..stored.arrays import StoredArrays
+from ..util.stored_arrays import StoredArrays
 from .camera import film_extent
 from .statistics import RenderStatistics
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..lightweight.geometry import Lightweight
+from .lightweight.geometry import Lightweight
 
 
 def lightweight_shapes(scene: mi.Scene) -> list[mi.Shape]:

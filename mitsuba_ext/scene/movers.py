@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import drjit as dr
 import mitsuba as mi
 
-from ..motion.rigid_motion import Motion
+from .motion.rigid_motion import Motion
 
 
 def movers(scene: mi.Scene) -> list[mi.Shape]:

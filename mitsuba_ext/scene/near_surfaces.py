@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..util.arrays import from_numpy
 
 #: Objects count as small if they are smaller than this many offsets.
 _SMALL = 1000

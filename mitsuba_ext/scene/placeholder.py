@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..util.arrays import from_numpy
 
 
 def span(mesh: mi.Mesh, low: np.ndarray, high: np.ndarray) -> None:

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..errors import did_you_mean
+from ..util.errors import did_you_mean
 from . import registry
 from .pages import Parameter, read_page
 

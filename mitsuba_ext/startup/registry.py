@@ -37,19 +37,19 @@ _KINDS: dict[str, str] = {
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
 _BASES = (
-    "mitsuba_ext.composition.staged_integrator",
-    "mitsuba_ext.composition.decision_plugin",
-    "mitsuba_ext.composition.walk_integrator",
-    "mitsuba_ext.composition.remembering_path",
-    "mitsuba_ext.composition.sensitive_path",
-    "mitsuba_ext.composition.bidirectional_integrator",
-    "mitsuba_ext.composition.chain_integrator",
-    "mitsuba_ext.composition.metropolis_integrator",
-    "mitsuba_ext.composition.wrapping_integrator",
-    "mitsuba_ext.composition.reweighted_camera",
-    "mitsuba_ext.sequences.sequence_sampler",
-    "mitsuba_ext.luminaires.area_luminaire",
-    "mitsuba_ext.luminaires.moving_emitter",
+    "mitsuba_ext.bases.staged_integrator",
+    "mitsuba_ext.bases.decision_plugin",
+    "mitsuba_ext.bases.walk_integrator",
+    "mitsuba_ext.bases.remembering_path",
+    "mitsuba_ext.bases.sensitive_path",
+    "mitsuba_ext.bases.bidirectional_integrator",
+    "mitsuba_ext.bases.chain_integrator",
+    "mitsuba_ext.bases.metropolis_integrator",
+    "mitsuba_ext.bases.wrapping_integrator",
+    "mitsuba_ext.bases.reweighted_camera",
+    "mitsuba_ext.bases.sequence_sampler",
+    "mitsuba_ext.scene.luminaires.area_luminaire",
+    "mitsuba_ext.scene.luminaires.moving_emitter",
 )
 
 _registered: set[str] = set()

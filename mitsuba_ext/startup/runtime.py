@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from types import ModuleType
 
-from ..errors import InstallationError
+from ..util.errors import InstallationError
 from . import llvm
 
 #: The variants in which the plugins work.

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..arrays import channel_mean
+from ..util.arrays import channel_mean
 from .estimator import CameraRays
 
 

@@ -29,14 +29,7 @@ import mitsuba as mi
 
 from ..scene.media import may_have_grids, may_have_media
 from .estimator import CameraRays
-from .free_flight import (
-    Distances,
-    attenuation,
-    component,
-    extinction,
-    interaction_at,
-    track,
-)
+from .free_flight import Distances, attenuation, component, extinction, interaction_at, track
 from .hidden_emitters import behind_emitters
 from .path_decisions import SceneQuery
 from .transmittance import transmittance

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError
 from ...images import metrics, reading
+from ...util.errors import InputError
 from .records import Record, pictured_runs
 
 #: The exposure maps this percentile of the reference's luminance …

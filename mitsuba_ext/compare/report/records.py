@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
+from ...util.errors import InputError
 
 #: The schema of ``results.json`` that this report can read.
 SCHEMA = 2

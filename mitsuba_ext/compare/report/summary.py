@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
 from ...images import metrics, reading
+from ...util.errors import InputError
 from . import pictures, records, tables
 from .page import environment, level_name
 from .records import Record

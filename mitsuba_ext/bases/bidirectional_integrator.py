@@ -1,0 +1,229 @@
+"""The base class of integrators with light paths beside camera paths.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..estimators.light_paths.choice.candidates import Candidate
+from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
+from ..estimators.light_paths.choice.technique_images import TechniqueImages
+from ..estimators.light_paths.light_side import LightSide
+from ..estimators.light_paths.light_vertices import Layout, bytes_per_vertex
+from ..estimators.light_paths.light_walk import STRIDE, LightWalk
+from ..estimators.light_paths.merging.merging_parameters import MergingParameters, share_rays
+from ..estimators.light_paths.merging.merging_radius import MergingRadius
+from ..estimators.light_paths.partial_sums import PartialSums
+from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
+from ..images import image_files
+from ..rendering.camera import film_extent
+from ..scene.movers import movers
+from ..transport.estimator import Estimator
+from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
+from .slots import BIDIRECTIONAL_SLOTS, read_slot
+from .walk_integrator import WalkIntegrator
+
+#: The decisions that a scene can replace, of camera paths and of light paths.
+_SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
+
+#: Bytes for what a pass stores; and bytes, about, that a light path takes besides the vertices that
+#: are stored at a time, and that a camera path takes.
+_PASS_BYTES, _LIGHT_BYTES, _CAMERA_BYTES = 1 << 29, 512, 128
+
+
+class LightPathIntegrator(WalkIntegrator):
+    """Camera paths and light paths, whose vertices are connected."""
+
+    #: See :class:`bdpt`.
+    connections, light_image, sample_direct, technique_images = 1, True, True, ""
+    #: Where vertices are merged; ``None`` if they are not.
+    merging: MergingParameters | None = None
+    #: Are all vertices merged, or only those to which light comes from a delta lobe?
+    merges_all = False
+    #: What a render uses if no decision says that.
+    techniques_by_default = Candidate(1.0, merges=True)
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.techniques: TechniqueImages | None = None
+        self._radius: Callable[..., MergingRadius | None] | None = None
+
+    @property
+    def needs_equal_samples(self) -> str:
+        if self.light_image:
+            return 'its light paths find light for all pixels: set "light_image" to false'
+        if self.technique_images:
+            return 'its images of techniques count all samples alike: leave "technique_images" out'
+        return super().needs_equal_samples
+
+    @property
+    def sample_cost(self) -> int:
+        return max(3, super().sample_cost)
+
+    @property
+    def most_lanes(self) -> int:
+        return _most_lanes(getattr(self.slots.get("light_paths"), "count", 1.0))
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
+        if not scene.emitters() or self.max_depth < 2:
+            return self.walk
+        side = LightSide.of(self.name, scene, sensor, self.light_image)
+        check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
+        film = sensor.film()
+        if self.technique_images:
+            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
+        self._radius = Once(functools.partial(self.merging_radius, scene, sensor, side))
+        return functools.partial(self._estimator, side, self._radius)
+
+    def merging_radius(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        side: LightSide,
+        next_event: EmitterSampling | None = None,
+        splits: bool = False,
+    ) -> MergingRadius | None:
+        """Within what radius vertices of a render are merged; ``None`` if they are not. With the
+        ``next_event`` and ``splits`` of its sums, its light paths have the same kernel."""
+        if self.merging is None:
+            return None
+        sums = PartialSums(
+            next_event or EmitterSampling(), dr.opaque(mi.Float, 1), splits=splits,
+            merging=dr.opaque(mi.Float, 1), light_paths=dr.opaque(mi.Float, 1),
+            has_clear_curves=side.emission.has_clear_curves,
+        )  # fmt: skip
+        light_walk = LightWalk(
+            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
+        )
+        return self.merging.radius_of(
+            scene, sensor, light_walk, not self.merges_all, self.samples_before
+        )
+
+    def schedule(self, scene, sensor, samples, seed):
+        self._radius = None
+        schedule = super().schedule(scene, sensor, samples, seed)
+        if self._radius is not None and (mi.is_spectral or movers(scene)) and self._radius():
+            share_rays(schedule.camera, scene, seed)
+        return schedule
+
+    def _estimator(
+        self, side: LightSide, radius_of: Callable[..., MergingRadius | None], **decisions: Any
+    ) -> Estimator:
+        always = LightPathChoice(self.techniques_by_default, self.techniques)
+        choice: LightPathChoice = decisions.pop("light_paths", always)
+        techniques = choice.techniques
+        are_traced = techniques.light_paths > 0
+        selection = decisions.pop("subpath_selection", SubpathSelection())
+        next_event = decisions.pop("next_event", None)
+        if not self.sample_direct:
+            next_event = NoConnections()
+        elif are_traced:
+            next_event = side.next_event(next_event)
+        else:
+            next_event = next_event or side.correct
+        if next_event:
+            decisions["next_event"] = next_event
+        walk = self.walk(**decisions)
+        if not are_traced:
+            return walk
+        radius = None
+        if techniques.merges:
+            compares = choice.observer is not None and choice.observer.compares
+            radius = radius_of(walk.next_event, compares)
+        if radius is not None and choice.pixel_width > 1:
+            radius = radius.of_coarse_film(choice.pixel_width)
+        return BidirectionalPathTracer(
+            walk, side.emission, side.sensor, self.connections * techniques.connections,
+            selection, choice.observer, radius=radius,
+            merges_all=self.merges_all, light_paths=techniques.light_paths,
+            most_lanes=_most_lanes(techniques.light_paths),
+        )  # fmt: skip
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
+        self.techniques = None
+        if self.technique_images:
+            check = image_files.check_exr_target
+            self.check_target("technique_images", self.technique_images, check)
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+        if self.techniques is not None:
+            self.techniques.write(Path(self.technique_images), self.statistics.spp)
+        elif self.technique_images:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
+                f'paths: "{self.technique_images}" is not written.',
+            )
+        return image
+
+
+class BidirectionalIntegrator(LightPathIntegrator):
+    """A :class:`LightPathIntegrator` with the parameters of :class:`bdpt`."""
+
+    has_light_paths = True
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.connections = self.parameter(props, "connections", 1, minimum=0, maximum=1024)
+        self.light_image = self.parameter(props, "light_image", True)
+        self.sample_direct = self.parameter(props, "sample_direct", True)
+        self.technique_images = self.parameter(props, "technique_images", "")
+        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
+        without_direct = ("next_event", "shadow_test", "light_paths")
+        without_images = ("light_paths",) if self.technique_images else ()
+        for key, refused in (
+            ("sample_direct", () if self.sample_direct else without_direct),
+            ("technique_images", without_images),
+        ):
+            for slot in self.slots.keys() & set(refused):
+                raise ValueError(
+                    f'"{self.name}": the parameter "{slot}" cannot be combined with '
+                    f'"{key} = {getattr(self, key)}"; leave it out'
+                )
+        if self.technique_images and self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": "technique_images" and "checkpoint" exclude each other: the '
+                f"images are those of one render"
+            )
+        if self.technique_images and not self.technique_images.endswith(".exr"):
+            raise ValueError(
+                f'"{self.name}": "technique_images" is "{self.technique_images}"; the name of the '
+                f'file must end with ".exr"'
+            )
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            "connections": self.connections,
+            "light_image": self.light_image,
+            "sample_direct": self.sample_direct,
+            "technique_images": self.technique_images or "none",
+            "light_paths": "always",
+            **super().parameters(),
+        }
+
+
+class Once:
+    """A function that is called once, when its result is first needed."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function: Callable[..., Any] | None = function
+        self._result: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._function is not None:
+            self._result, self._function = self._function(*arguments), None
+        return self._result
+
+
+def _most_lanes(light_paths: float) -> int:
+    """The most camera paths in a pass, with so many light paths for each."""
+    layout = Layout(len(mi.Spectrum()), 5, True)
+    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _LIGHT_BYTES
+    return int(_PASS_BYTES / (light_paths * bytes_per_path + _CAMERA_BYTES))

@@ -1,0 +1,41 @@
+"""The base class of plugins that a scene nests into a slot of an integrator.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..planning.decision_parameters import DecisionParameters, ParameterReader
+
+
+class DecisionPlugin(mi.Sampler):
+    """A decision of the walk, with its parameters. For Mitsuba it is a sampler, which can be nested
+    in an integrator; it cannot be the sampler of a sensor.
+
+    Attributes:
+        kind: The class that reads the parameters of the scene.
+        decision_parameters: The parameters that were read.
+    """
+
+    kind: type[DecisionParameters]
+
+    def __init__(self, props: mi.Properties) -> None:
+        # The base class reads no parameters, as those that it accepts have no effect here
+        super().__init__(mi.Properties("independent"))
+        self.name = props.plugin_name()
+        self.decision_parameters = self.kind(ParameterReader(self.name, props))
+
+    def to_string(self) -> str:
+        values = self.decision_parameters.parameters().items()
+        lines = ",\n".join(f"  {key} = {value}" for key, value in values)
+        return f"{self.name}[\n{lines}\n]"
+
+    def _refuse(self, *_arguments):
+        slots = " or ".join(f'"{slot}"' for slot in self.decision_parameters.slots)
+        raise RuntimeError(
+            f'"{self.name}" is not a sampler for sensors: nest it in a "composed_path", as {slots}.'
+        )
+
+    clone = fork = seed = set_sample_count = next_1d = next_2d = _refuse

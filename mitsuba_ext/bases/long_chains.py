@@ -1,0 +1,73 @@
+"""What integrators with long Markov chains share: parameters, and the render of the chains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+
+from ..estimators.chains.path_target import PathTarget
+from ..estimators.chains.small_steps import SmallSteps
+from ..estimators.chains.target import ImageTarget
+from ..estimators.chains.visits import ChainSettings, MetropolisRender
+
+if TYPE_CHECKING:
+    from .chain_integrator import ChainIntegrator
+
+
+@dataclass
+class LongChains:
+    """Chains that last for the whole render.
+
+    Attributes:
+        chains: Number of chains; 0 for a number that suits the render.
+        luminance_samples: Least number of samples that estimate the brightness of the image.
+        p_large: The probability of a mutation that does not depend on the state of the chain.
+        two_stage: Does a first stage make the visits even over the film?
+        uses_uniform: Are large steps also used as independent samples?
+        steps: The small steps of primary samples.
+    """
+
+    chains: int
+    luminance_samples: int
+    p_large: float
+    two_stage: bool
+    uses_uniform: bool = True
+    steps: SmallSteps = SmallSteps()
+
+    @classmethod
+    def read(
+        cls, integrator: ChainIntegrator, props: mi.Properties, p_large: float
+    ) -> LongChains:
+        """Reads the parameters of an integrator; ``p_large`` is the default of that parameter."""
+        return cls(
+            integrator.parameter(props, "chains", 0, minimum=0, maximum=1 << 20),
+            integrator.read_luminance_samples(props),
+            integrator.parameter(props, "p_large", p_large, minimum=0.0, maximum=1.0),
+            integrator.parameter(props, "two_stage", False),
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """What ``str()`` of the integrator shows."""
+        return {
+            "chains": self.chains,
+            "p_large": self.p_large,
+            "luminance_samples": self.luminance_samples,
+            "two_stage": self.two_stage,
+        }
+
+    def render(
+        self,
+        integrator: ChainIntegrator,
+        target: ImageTarget | PathTarget,
+        seed: int,
+        *render: Any,
+    ) -> MetropolisRender:
+        """Makes the render of the chains. The parameters after the integrator are those of
+        :meth:`ChainIntegrator.chain_render`."""
+        settings = ChainSettings(
+            self.chains, self.luminance_samples, self.p_large, self.steps, self.uses_uniform,
+            self.two_stage, integrator.state_file(target, seed),
+        )  # fmt: skip
+        return MetropolisRender(settings, integrator, target, seed, *render)

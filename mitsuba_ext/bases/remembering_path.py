@@ -1,0 +1,143 @@
+"""A path tracer that remembers what it has learned, for the renders of an optimization.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mitsuba as mi
+
+from ..planning.decision_parameters import Setting
+from ..rendering.stages import OneStage
+from ..scene.mark import SceneMark
+from ..scene.media import refuse_media
+from ..scene.movers import movers
+from ..transport.heroes import disperses
+from ..transport.walk import Walk
+from .schedule import Schedule
+from .slots import SLOTS, read_slot
+from .walk_integrator import WalkIntegrator
+
+#: The decisions that a scene can replace: those that do not change camera rays.
+_SLOTS = ("directions", "next_event", "roulette", "connections", "mis", "shadow_test")
+
+#: Decisions whose weights are not radiance / density.
+_NOT_DETACHED = {"next_event": ("resampled_lights", "two_stage_lights"), "directions": ("swarm",)}
+
+
+class _Remembered:
+    """What a render has learned. (Neither a tuple nor a dataclass: Dr.Jit does not look for arrays
+    in it, as it does in the attributes of a scene's own integrator.)
+
+    Attributes:
+        scene: The scene that was rendered.
+        decisions: The decisions of the last stage that differ from those of ``path``, by slot.
+        said: ``learned`` and ``effects`` of the statistics.
+    """
+
+    def __init__(
+        self, scene: SceneMark, decisions: dict[str, Any], said: tuple[str, dict[str, Any]]
+    ) -> None:
+        self.scene, self.decisions, self.said = scene, decisions, said
+
+
+class RememberingPath(WalkIntegrator):
+    """The primal renders of :class:`composed_prb`. The first render of a scene learns; the next
+    ones use what it has learned, without pilot samples."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
+        for slot, refused in _NOT_DETACHED.items():
+            if slot in self.slots and self.slots[slot].name in refused:
+                raise ValueError(
+                    f'"{self.name}": there are no gradients with the "{self.slots[slot].name}" of '
+                    f'the parameter "{slot}": choose another one'
+                )
+        for key in ("aovs", "checkpoint", "keep_learned"):
+            if getattr(self, key):
+                raise ValueError(f'"{self.name}" has no parameter "{key}": leave it out')
+        self.learn_every = 0
+        if self.can_learn:
+            self.learn_every = self.parameter(props, "learn_every", 16, minimum=0)
+        self._remembered: _Remembered | None = None
+        self._schedule: Schedule | None = None
+        self._renders = 0
+
+    def parameters(self) -> dict[str, Any]:
+        words = {slot: next(iter(SLOTS[slot])) for slot in _SLOTS}
+        every = {"learn_every": self.learn_every} if self.can_learn else {}
+        return {**words, **super().parameters(), **every}
+
+    def common_parameters(self) -> dict[str, Any]:
+        known = super().common_parameters()
+        del known["aovs"]
+        return known
+
+    def forget(self) -> None:
+        """Learns in the next render, whatever ``learn_every`` is."""
+        self._remembered = None
+
+    def remembered(self, scene: mi.Scene) -> Walk:
+        """The walk of the last stage of the last render of ``scene``. If there was none, decisions
+        that learn fall back to their defaults."""
+        if self._knows(scene):
+            return self.walk(**self._remembered.decisions)
+        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
+        decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
+        return self.walk(query=self.query(scene), **{s: d for s, d in decisions.items() if d})
+
+    def _knows(self, scene: mi.Scene) -> bool:
+        # Decisions that do not learn are made again: what they depend on may have changed
+        return self.can_learn and bool(self._remembered) and self._remembered.scene.is_of(scene)
+
+    @property
+    def is_due(self) -> bool:
+        """Is what it has learned too old?"""
+        return 0 < self.learn_every <= self._renders
+
+    def pilots(self, scene, sensor, spp, kernels=math.inf):
+        if self.is_due:
+            self.forget()
+        if self._knows(scene):
+            return []
+        # Many renders use what this one learns: pilots have up to three quarters of its samples
+        return super().pilots(scene, sensor, 3 * spp, kernels)
+
+    def pace_stage(self, scene, sensor, spp):
+        # Its pilots are worth their time in later renders
+        return None
+
+    def schedule(self, scene, sensor, samples, seed):
+        self._renders += 1
+        if self._knows(scene):
+            return OneStage(self.walk(**self._remembered.decisions))
+        self._schedule, self._renders = super().schedule(scene, sensor, samples, seed), 1
+        return self._schedule
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
+        self._schedule = None
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+        if self._schedule is not None and not self.statistics.interrupted:
+            said = self.statistics.learned, self.statistics.effects
+            decisions = dict(self._schedule.decisions)
+            self._remembered = _Remembered(SceneMark(scene), decisions, said)
+        elif self._knows(scene):
+            self.statistics.learned, self.statistics.effects = self._remembered.said
+        self._schedule = None
+        return image
+
+    def query(self, scene):
+        refuse_media(scene, f'"{self.name}"', 'use "prbvolpath"')
+        if movers(scene):
+            raise NotImplementedError(
+                f'"{self.name}": there are no gradients of scenes with moving shapes or cameras'
+            )
+        if mi.is_spectral and disperses(scene.shapes()):
+            raise NotImplementedError(
+                f'"{self.name}": there are no gradients of scenes with dispersion'
+            )
+        return super().query(scene)

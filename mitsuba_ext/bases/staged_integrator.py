@@ -1,0 +1,278 @@
+"""The base class of our integrators that render in stages: the methods that Mitsuba calls, and
+errors in the place of Mitsuba's where those are cryptic.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from ..long_renders.intervals import Interval
+from ..rendering import camera
+from ..rendering import render as rendering
+from ..rendering.interrupts import interrupted
+from ..rendering.stages import Schedule, Stage
+from ..rendering.statistics import RenderStatistics
+from ..rendering.turns import in_turn
+from ..util.parameters import read_parameter
+
+#: Stands for "no limit" in counts.
+NO_LIMIT = 0xFFFFFFFF
+
+#: Parameters on which the image of a checkpointed render does not depend.
+_NOT_OF_THE_IMAGE = ("timeout", "checkpoint", "checkpoint_every")
+
+
+class StagedIntegrator(mi.SamplingIntegrator):
+    """An integrator that renders in stages and passes (``render.py``).
+
+    .. pluginparameters::
+
+     * - timeout
+       - |float|
+       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. The
+         number of samples follows from the speed of the first passes (short ones, until one
+         compiles nothing, and then one of a quarter of the time left), and not from the clock, so
+         that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
+         that fit. Learning ends when it has taken a third of the time. It does not begin in renders
+         of about a second, nor where compiling its kernels would take longer than that. The limit
+         is met as closely as the speed is steady; a short pass of each pilot that has begun, and
+         one of the last stage, are always rendered. (Default: -1)
+
+     * - checkpoint
+       - |string|
+       - A folder in which the render is saved: a second render (of the same scene, seed and
+         parameters) continues from there, up to ``spp``, which may be higher than before. It
+         renders in batches, as ``mitsuba-ext render --checkpoint`` does. Only the outermost
+         integrator can have it. (Default: none)
+     * - checkpoint_every
+       - |string|
+       - How often it is saved: :monosp:`60s`, :monosp:`10m`, :monosp:`2h` or :monosp:`100spp`. Only
+         with :monosp:`checkpoint`. (Default: 60s)
+
+    Attributes:
+        sees_all: True, as it renders ``moving`` and lightweight shapes.
+        progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
+        statistics: The statistics of the last render
+            (:class:`~mitsuba_ext.rendering.statistics.RenderStatistics`).
+    """
+
+    sees_all = True
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.name = props.plugin_name()
+        # Read before the base class reads them, as its errors do not name the plugin
+        self.timeout = self.parameter(props, "timeout", -1.0)
+        self.parameter(props, "hide_emitters", False)
+        super().__init__(props)
+        # Deprecated by Mitsuba, which warns in the log
+        self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
+        self.checkpoint = self.parameter(props, "checkpoint", "")
+        if self.checkpoint:
+            self.checkpoint_every = self._interval(props)
+        self._is_batch = False
+        #: If a render is one of several batches: samples per pixel of those with smaller numbers.
+        self.samples_before = 0
+        self.progress: Callable[[float], None] | None = None
+        self.statistics = RenderStatistics()
+        self.is_cancelled = False
+
+    # ---- What a subclass overrides ----
+
+    def pilots(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+    ) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns. See
+        :class:`mitsuba_ext.rendering.plan.Planned`."""
+        return []
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        """See :class:`mitsuba_ext.rendering.render.Staged`."""
+        return None
+
+    @property
+    def sample_cost(self) -> int:
+        """The approximate time of a sample in units of that of a path: passes take fewer samples
+        if it is larger."""
+        return 1
+
+    @property
+    def most_lanes(self) -> int:
+        """The most samples in a pass that memory allows."""
+        return NO_LIMIT
+
+    def samples_per_set(self, spp: int) -> int:
+        """How many of the ``spp`` samples of a pixel form a set. A timeout does not stop within
+        a set."""
+        return 1
+
+    @property
+    def needs_equal_samples(self) -> str:
+        """Why all pixels must get the same number of samples; empty if they need not. The text
+        ends a sentence in an error message, and says what to change."""
+        return ""
+
+    @property
+    def default_spp(self) -> int:
+        """Samples per pixel of a render that does not say how many; 0 for the sampler's number."""
+        return 0
+
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        """Makes one stage for each entry of ``samples`` (samples per pixel): pilots, and the last
+        one."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, Any]:
+        """The parameters that ``str()`` shows besides the common ones."""
+        return {}
+
+    def common_parameters(self) -> dict[str, Any]:
+        """The parameters that ``str()`` shows of all integrators with this base class."""
+        if not self.checkpoint:
+            return {"timeout": self.timeout}
+        every = self.checkpoint_every
+        return {
+            "timeout": self.timeout,
+            "checkpoint": self.checkpoint,
+            "checkpoint_every": f"{every.spp}spp" if every.spp else f"{every.seconds:g}s",
+        }
+
+    # ---- What Mitsuba calls ----
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        spp = self._checked(scene, spp) or self.default_spp
+        sensor = camera.find_sensor(scene, sensor)
+        with in_turn(self, sensor, self._forget_cancel):
+            if self.checkpoint and not self._is_batch:
+                return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
+            return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        """Renders the whole image, or one batch of a checkpointed render."""
+        return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        """The values of the channels that :meth:`aov_names` names; none by default."""
+        return []
+
+    def cancel(self) -> None:
+        """Ends the running render after the current pass (call it from ``progress`` or from another
+        thread); the image of the finished passes is returned."""
+        self.is_cancelled = True
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def to_string(self) -> str:
+        parameters = {**self.common_parameters(), **self.parameters()}
+        lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
+        return f"{self.name}[\n{lines}\n]"
+
+    # ---- Checkpointed renders ----
+
+    def _forget_cancel(self) -> None:
+        """Forgets that an earlier render was cancelled. (Not in turn: whoever cancels a render that
+        waits for its turn means this one.)"""
+        if not self._is_batch:
+            self.is_cancelled = False
+
+    def _interval(self, props: mi.Properties) -> Interval:
+        text = self.parameter(props, "checkpoint_every", "60s")
+        try:
+            return Interval.parse(text)
+        except ValueError as error:
+            raise ValueError(f'"{self.name}": the parameter "checkpoint_every": {error}') from None
+
+    def _render_kept(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        # Imported here: the modules of batches are above this one, and import it
+        from ..long_renders.kept_render import KeptRender
+
+        begin = time.perf_counter()
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        shown = {**self.common_parameters(), **self.parameters()}
+        shown = {key: value for key, value in shown.items() if key not in _NOT_OF_THE_IMAGE}
+        kept = KeptRender(self, Path(self.checkpoint), self.checkpoint_every, str(shown))
+        timeout, progress = self.timeout, self.progress
+        self.timeout, self.progress, self._is_batch = -1.0, None, True
+        try:
+            state, is_interrupted = kept.run(
+                scene, sensor, seed & 0xFFFFFFFF, spp, timeout if timeout > 0 else None, progress
+            )
+        finally:
+            self.timeout, self.progress, self._is_batch = timeout, progress, False
+        totals = state.totals
+        self.statistics = RenderStatistics(
+            len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
+            totals.learning_seconds, dict(totals.rays), totals.connections,
+            self.statistics.zero_radiance, totals.learned, dict(totals.effects),
+            totals.memory_bytes, is_interrupted or self.is_cancelled, totals.tracing_seconds,
+            dict(totals.kernels),
+        )  # fmt: skip
+        image = camera.develop(sensor.film(), develop, evaluate)
+        if is_interrupted:
+            raise interrupted(self.name)
+        return image
+
+    def check_sampled(self) -> None:
+        """
+        Raises:
+            ValueError: Another integrator draws the samples of this one, which has the parameter
+                ``checkpoint``.
+        """
+        if self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": the parameter "checkpoint" has no effect where another integrator '
+                f"draws the samples: leave it out"
+            )
+
+    # ---- Helpers ----
+
+    def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
+        """Reads and checks a parameter of the scene: see
+        :func:`mitsuba_ext.util.parameters.read_parameter`, also for what ``accepted`` can be."""
+        return read_parameter(self.name, props, key, default, **accepted)
+
+    def _checked(self, scene: Any, spp: Any) -> int:
+        """The argument ``spp`` of :meth:`render`.
+
+        Raises:
+            TypeError: An argument has another type.
+            ValueError: The integrator or the scene is of another variant than the active one.
+        """
+        if type(scene).__name__ != "Scene":  # each variant has a class of this name
+            raise TypeError(
+                f'"{self.name}": a scene is needed (from mi.load_file or mi.load_dict), found an '
+                f"object of type {type(scene).__name__}"
+            )
+        for what, value in ((f'"{self.name}"', self), ("the scene", scene)):
+            if value.variant_name() != mi.variant():
+                raise ValueError(
+                    f'{what} was made in the variant "{value.variant_name()}", and the active one '
+                    f'is "{mi.variant()}": select that one, or make it again'
+                )
+        try:
+            return operator.index(spp)
+        except TypeError:
+            raise TypeError(
+                f'"{self.name}": spp is {spp!r}; it must be a whole number'
+            ) from None
+
+    def no_gradients(self) -> NotImplementedError:
+        """The error for a render with gradients."""
+        return NotImplementedError(
+            f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
+            f'"composed_prb" or "prb".'
+        )

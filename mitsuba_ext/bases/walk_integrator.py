@@ -1,0 +1,361 @@
+"""The base class of our integrators whose samples are random walks.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..planning import kept_learning, learned_file
+from ..planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ..planning.learner import Learner
+from ..rendering.camera import film_extent
+from ..rendering.stages import Stage
+from ..scene.aovs import check_aovs
+from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
+from ..scene.unseen import has_unseen_shapes
+from ..techniques.swarming.parameters import Swarm, stage_weights
+from ..techniques.weighted_points.camera_numbers import WeightedNumbers, samples_per_set
+from ..transport.estimator import CameraRays, Estimator
+from ..transport.path_decisions import EmitterSampling, SceneQuery
+from ..transport.queries.aovs import output_variables
+from ..transport.queries.scene import scene_query
+from ..transport.walk import Walk
+from ..util.errors import InputError
+from ..util.stored_arrays import StoredArrays
+from .schedule import Schedule, pilot_samples
+from .slots import BIDIRECTIONAL_SLOTS, SLOTS
+from .staged_integrator import NO_LIMIT, StagedIntegrator
+
+#: A render that learns compiles about so many kernels as large as that of ``path``: those of its
+#: pilots, and that of the last stage, are larger, and there are many small ones.
+LEARNING_KERNELS = 6
+
+#: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
+_LEAST_SPP = 4
+
+
+class WalkIntegrator(StagedIntegrator):
+    """An integrator whose samples are random walks.
+
+    A subclass reads its own parameters and calls :meth:`fill` with the decisions of the walk that
+    it replaces.
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
+         illumination, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+     * - (Common parameters)
+       - |float|
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
+     * - aovs
+       - |string|
+       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
+         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+
+    Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
+    ``keep_learned``; see :class:`composed_path`.
+
+    Attributes:
+        has_light_paths (bool): Does it trace light paths besides camera paths?
+        sees_media (bool): Does it render participating media? If not, it refuses them.
+        light_paths_see_media (bool): Do its light paths, if it has any, scatter in them?
+        slots (dict[str, DecisionParameters]): What fills the slots of the walk.
+        learners (dict[str, Learner]): The learners of the last render, by slot.
+    """
+
+    has_light_paths = light_paths_see_media = False
+    sees_media = True
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        max_depth = self.parameter(props, "max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
+        self.max_depth = max_depth if max_depth >= 0 else NO_LIMIT
+        self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=NO_LIMIT)
+        self.aovs = self.parameter(props, "aovs", "")
+        self._aovs = self._aov_integrator(self.aovs)
+        self.slots: dict[str, DecisionParameters] = {}
+        self.learners: Mapping[str, Learner] = {}
+        self._pilot_spp: int | None = None
+        #: Says why the last render learned nothing, if it was too short.
+        self.too_short = ""
+        self.save_learned = self.load_learned = ""
+        self.keep_learned = False
+        self._kept: kept_learning.Kept | None = None
+
+    # ---- What a subclass calls ----
+
+    def reader(
+        self, props: mi.Properties, names: Mapping[str, str] | None = None, **defaults: Any
+    ) -> ParameterReader:
+        """Reads the parameters of a decision from those of the integrator. ``names`` are the
+        integrator's names where they differ, ``defaults`` the integrator's own defaults."""
+        return ParameterReader(self.name, props, names, **defaults)
+
+    def fill(self, props: mi.Properties, **slots: DecisionParameters | None) -> None:
+        """Fills slots of the walk; ``None`` leaves a slot to Mitsuba's choice. If a decision
+        learns, reads the common parameters ``pilot_spp``, ``save_learned``, ``load_learned`` and
+        ``keep_learned``.
+
+        Raises:
+            TypeError, ValueError: Two decisions exclude each other, or a parameter is wrong.
+        """
+        known = (*SLOTS, *BIDIRECTIONAL_SLOTS)
+        self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
+        for slot, parameters in self.slots.items():
+            parameters.check_together(self.name, self.slots)
+            if self.has_light_paths and parameters.camera_paths_only:
+                raise ValueError(
+                    f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
+                    f"integrators without light paths"
+                )
+        wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
+        if wishes:
+            self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
+            self.save_learned = self.parameter(props, "save_learned", "")
+            self.load_learned = self.parameter(props, "load_learned", "")
+            self.keep_learned = self.parameter(props, "keep_learned", False)
+            for key in ("save_learned", "keep_learned"):
+                if self.load_learned and getattr(self, key):
+                    raise ValueError(
+                        f'"{self.name}": with "load_learned" nothing is learned: leave "{key}" out'
+                    )
+
+    def parameters(self) -> dict[str, Any]:
+        learning = {
+            "pilot_spp": self._pilot_spp,
+            "save_learned": self.save_learned,
+            "load_learned": self.load_learned,
+            "keep_learned": self.keep_learned or "",
+        }
+        given = {key: value for key, value in learning.items() if value not in (None, "")}
+        return {**self._described_slots(), **given}
+
+    def check_target(
+        self, key: str, file: str, check: Callable[[Path], None] = learned_file.check_target
+    ) -> None:
+        """
+        Raises:
+            ValueError: The file that the parameter ``key`` names cannot be written, or ``check``
+                finds that there is one of another kind.
+        """
+        try:
+            check(Path(file))
+        except InputError as error:
+            raise ValueError(f'"{self.name}": "{key}": {error}') from None
+
+    # ---- What the render calls ----
+
+    @property
+    def can_learn(self) -> bool:
+        """Do ``save_learned`` and ``load_learned`` have an effect?"""
+        return bool(self._pilot_spp)
+
+    @property
+    def restores(self) -> bool:
+        """Does the render that :meth:`pilots` has planned use what an earlier one has learned?"""
+        return bool(self.load_learned or self._kept)
+
+    def pilots(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+    ) -> list[int]:
+        self.learners, self._kept = {}, None
+        if self.save_learned:
+            self.check_target("save_learned", self.save_learned)
+        self.too_short = ""
+        if self.max_depth < 2 or self.load_learned:
+            return []
+        pixel_count = math.prod(film_extent(sensor.film()))
+        pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
+        if self.keep_learned:
+            kept = kept_learning.find(scene, self._learned_by(sensor))
+            if kept is not None and sum(pilots) <= kept.pilot_spp:
+                self._kept = kept
+                return []
+        if kernels < LEARNING_KERNELS:
+            self.too_short = "nothing: the time limit is too short"
+            return []
+        if self._pilot_spp and spp < _LEAST_SPP:
+            self.too_short = f"nothing: {spp} spp are too few"
+        return pilots
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        if self.has_light_paths:
+            # Camera paths alone would miss the light of some lights, and are much faster
+            return None
+        # Where maps help much, samples without them are worth less
+        swarms = any(isinstance(p, Swarm) and p.can_learn(scene, 1) for p in self.slots.values())
+        weight = stage_weights((1, spp - 1))[0] if swarms else 1.0
+        walk = Walk(
+            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(scene)
+        )
+        return Stage(walk, weight=weight)
+
+    @property
+    def sample_cost(self) -> int:
+        return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
+
+    def samples_per_set(self, spp: int) -> int:
+        is_needed = any(isinstance(p, WeightedNumbers) for p in self.slots.values())
+        return samples_per_set(spp, self.timeout > 0) if is_needed else 1
+
+    @property
+    def needs_equal_samples(self) -> str:
+        for slot, parameters in self.slots.items():
+            if isinstance(parameters, WeightedNumbers):
+                return f'the sets of numbers of "{slot}" belong together: leave the parameter out'
+        return ""
+
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        *pilots, _rest = samples
+        # A loaded state needs no pilots, but learners to restore it: these need a pilot_spp > 0
+        pilot_spp = self._pilot_spp or 0 if self.restores else sum(pilots)
+        setting = Setting(
+            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
+            self.timeout > 0,
+        )  # fmt: skip
+        schedule = Schedule(
+            self.name, self.slots, setting, samples, self.estimators(scene, sensor),
+            self.query(scene), self._restored(scene, sensor),
+            self._savers(scene, sensor, sum(pilots)),
+        )  # fmt: skip
+        schedule.remark = self.too_short
+        self.learners = schedule.learners
+        return schedule
+
+    def _learned_by(self, sensor: mi.Sensor) -> str:
+        """On what, besides the scene, learned states depend."""
+        slots = [f"{slot} = {text}" for slot, text in self._described_slots().items()]
+        # The tables of some decisions have an entry for each pixel
+        width, height = film_extent(sensor.film())
+        return ", ".join([*slots, f"film = {width}x{height}"])
+
+    def _restored(self, scene: mi.Scene, sensor: mi.Sensor) -> learned_file.States | None:
+        """What an earlier render has learned; ``None`` if this one learns."""
+        if self.load_learned:
+            where = f'"{self.name}": the parameter "load_learned"'
+            path = Path(self.load_learned)
+            return learned_file.load(path, scene, self._learned_by(sensor), where)
+        if self._kept is None:
+            return None
+        return {slot: StoredArrays.of(state) for slot, state in self._kept.states.items()}
+
+    def _savers(
+        self, scene: mi.Scene, sensor: mi.Sensor, pilot_spp: int
+    ) -> list[Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]]:
+        """The functions that save what is learned, in a file and for this process."""
+        made_by, savers = self._learned_by(sensor), []
+        if self.save_learned:
+            path = Path(self.save_learned)
+            savers.append(functools.partial(learned_file.save, path, scene, made_by))
+        if self.keep_learned and pilot_spp:
+            savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
+        return savers
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
+        """The function that makes the estimator of a stage from its decisions: :meth:`walk`."""
+        return self.walk
+
+    def walk(self, **decisions: Any) -> Walk:
+        """A walk with this integrator's parameters and the given decisions. If ``light_numbers`` is
+        among them, it warps the primary samples of ``next_event``."""
+        light_numbers = decisions.pop("light_numbers", None)
+        if light_numbers is not None:
+            inner = decisions.get("next_event", EmitterSampling())
+            decisions["next_event"] = light_numbers.around(inner)
+        return Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
+
+    # ---- What Mitsuba calls ----
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
+        calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
+        back to its default.
+
+        Raises:
+            NotImplementedError: The integrator has light paths.
+        """
+        if self.has_light_paths:
+            raise NotImplementedError(
+                f'"{self.name}": light paths do not end where a ray begins: it cannot be nested '
+                f'in an integrator that asks for single samples, such as "moment" or "aov"; '
+                f'"variance" can hold it, and it has a parameter "aovs" of its own'
+            )
+        self.check_sampled()
+        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
+        decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
+        decisions = {slot: decision for slot, decision in decisions.items() if decision}
+        walk = self.walk(query=self.query(scene), **decisions)
+        sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
+        return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
+
+    def aov_names(self) -> list[str]:
+        return self._aovs.aov_names() if self._aovs else []
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        """The values of the channels that :meth:`aov_names` names."""
+        if self._aovs is None:
+            return []
+        if has_unseen_shapes(scene):
+            return output_variables(self._aovs, self.aovs, scene, sampler, ray)
+        return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
+
+    def common_parameters(self) -> dict[str, Any]:
+        return {
+            "max_depth": -1 if self.max_depth == NO_LIMIT else self.max_depth,
+            "rr_depth": self.rr_depth,
+            "hide_emitters": self.hide_emitters,
+            **super().common_parameters(),
+            "aovs": self.aovs or "none",
+        }
+
+    # ---- Helpers ----
+
+    def _described_slots(self) -> dict[str, str]:
+        return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
+
+    def query(self, scene: mi.Scene) -> SceneQuery:
+        """How rays are intersected with ``scene``.
+
+        Raises:
+            NotImplementedError: This integrator does not support something in ``scene``.
+        """
+        self._check_media(scene)
+        return scene_query(scene)
+
+    def _check_media(self, scene: mi.Scene) -> None:
+        if self.has_light_paths and not self.light_paths_see_media:
+            refuse_media(
+                scene, f'"{self.name}", whose light paths do not scatter in a medium,',
+                'use "sppm", "composed_path" or "volpath"',
+            )  # fmt: skip
+        if not self.sees_media:
+            refuse_media(scene, f'"{self.name}"', 'use "composed_path" or "volpath"')
+        for slot, parameters in self.slots.items():
+            if not parameters.sees_media:
+                what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
+                refuse_media(scene, what, 'choose another one, such as "contribution"')
+        refuse_moving_grids(scene, f'"{self.name}"')
+        refuse_missing_colours(scene, f'"{self.name}"')
+
+    def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
+        check_aovs(self.name, aovs)
+        return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None

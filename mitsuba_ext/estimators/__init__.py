@@ -1,0 +1,1 @@
+"""Estimators beside the plain walk: light paths, caches, chains, and defocus."""

@@ -1,0 +1,111 @@
+"""The state of a render with chains as NumPy arrays, for files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...util.arrays import from_numpy
+from ...util.stored_arrays import StoredArrays
+from .path_space.memory import Head, Logs, Place
+from .path_target import PathState
+from .target import Contribution
+
+#: Arrays by name.
+Arrays = dict[str, np.ndarray]
+
+#: The most numbers of an array whose length the reader does not know.
+_MOST_NUMBERS = 1 << 27
+
+#: The least and the largest value of an array or a field, by its name.
+Ranges = Mapping[str, tuple[Any, Any]]
+
+
+class StateFile(Protocol):
+    """A file that holds the state of a render."""
+
+    def load(self) -> StoredArrays | None:
+        """The saved state; ``None`` if none was saved yet."""
+
+    def save(self, arrays: Arrays) -> None:
+        """Saves a state, which replaces the one before."""
+
+
+def arrays_of(value: Any, name: str) -> Arrays:
+    """The arrays of which ``value`` consists. It may be a Dr.Jit array, a random number generator,
+    one of the structures of :func:`_kinds`, or a list of these."""
+    kinds = {made: kind for kind, made in _kinds().items()}
+    if isinstance(value, list):
+        parts = {str(index): part for index, part in enumerate(value)}
+    elif isinstance(value, mi.PCG32):
+        parts = {"rng.state": value.state, "rng.inc": value.inc}
+    elif type(value) in kinds:
+        parts = {f"{kinds[type(value)]}.{key}": part for key, part in vars(value).items()}
+    else:
+        return {name: value.numpy()}
+    found = (arrays_of(part, f"{name}/{key}") for key, part in parts.items())
+    return {key: array for arrays in found for key, array in arrays.items()}
+
+
+def value_of(
+    stored: StoredArrays, name: str, kind: type | list, width: int | None, ranges: Ranges
+) -> Any:
+    """The inverse of :func:`arrays_of`.
+
+    Parameters:
+        stored: The arrays of the file.
+        name: The name that was given to :func:`arrays_of`.
+        kind: What it was: a type, or a list of these.
+        width: The number of lanes; ``None`` for any, which all parts of a structure have.
+        ranges: The least and the largest value of arrays, and of the fields of structures, by
+            their names. Other real numbers are finite.
+
+    Raises:
+        DamagedError: The file has no such value.
+    """
+    if isinstance(kind, list):
+        parts = (f"{name}/{index}" for index in range(len(kind)))
+        return [value_of(stored, part, k, width, ranges) for part, k in zip(parts, kind)]
+    names = {made: name for name, made in _kinds().items()}
+    if kind not in names:
+        least, most = ranges.get(name) or ranges.get(_field(name)) or (None, None)
+        return _array(stored, name, kind, width, least, most)
+    made = dr.zeros(kind)
+    fields = {"state": mi.UInt64, "inc": mi.UInt64} if kind is mi.PCG32 else {
+        key: type(value) for key, value in vars(made).items()
+    }  # fmt: skip
+    for key, its_kind in fields.items():
+        part = f"{name}/{names[kind]}.{key}"
+        value = value_of(stored, part, its_kind, width, ranges)
+        width = dr.width(value) if width is None else width
+        setattr(made, key, value)
+    return made
+
+
+def _field(name: str) -> str:
+    """The last part of a name: the field of a structure."""
+    return name.rpartition("/")[2].rpartition(".")[2]
+
+
+def _kinds() -> dict[str, type]:
+    """The names of structures in files."""
+    return {
+        "rng": mi.PCG32, "found": Contribution, "path": PathState, "head": Head, "place": Place,
+        "logs": Logs,
+    }  # fmt: skip
+
+
+def _array(
+    stored: StoredArrays, name: str, kind: type, width: int | None, least: float | None,
+    most: float | None,
+) -> Any:  # fmt: skip
+    letter = {dr.VarType.Float32: "f", dr.VarType.Float64: "f"}.get(dr.type_v(kind), "u")
+    size = () if dr.depth_v(kind) == 1 else (dr.size_v(kind),)
+    longest = _MOST_NUMBERS if width is None else width * math.prod(size)
+    array = stored.take(name, letter, (*size, width), least, most, longest)
+    return kind(array) if size else from_numpy(kind, array)

@@ -1,0 +1,132 @@
+"""Second moments of sets of techniques, from the samples of all of them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ....util.arrays import from_numpy
+from ..merging.merging import HANDFUL
+from ..partial_sums import Rivals
+from .candidates import Candidate
+from .rare_contributions import BINS, bin_of
+
+
+class CandidateMoments:
+    """For each pixel and each candidate, sums over the samples of a pass: of the second moment, and
+    of the light image.
+
+    Let a candidate find a path of contribution f with the densities qᵢ. With the power heuristic,
+    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 but for merging. The
+    densities contain the number of samples: with twice the connections, theirs are twice as large.
+
+    Any technique that finds the path tells the terms of hits, next event estimation, the light
+    image and merging. Of merging at different vertices, only the sum of the squared densities is
+    known: the sum of their cubes is as if one of them had all of it. Several connections often find
+    the same path (corridor: up to four, whose cubes would be overestimated by half), so that only
+    the connection which found it tells its own term.
+
+    Parameters:
+        candidates: The candidates. That without light paths has the techniques of ``path`` alone.
+        pixels: Number of pixels.
+        samples_per_vertex: For each number of light paths that merging candidates have, how many
+            samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
+        blocks: Number of blocks of pixels, for each of which there are sums by value.
+        block_of: The block of each pixel; ``None`` if each has its own.
+    """
+
+    def __init__(
+        self,
+        candidates: list[Candidate],
+        pixels: int,
+        samples_per_vertex: dict[float, float],
+        blocks: int,
+        block_of: mi.UInt32 | None,
+    ) -> None:
+        self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
+        self._block_of = block_of
+        # MIS weights count a handful of vertices as one sample of a camera path; but these samples
+        # share vertices
+        shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
+        # Factors of the squared densities of light image, connections, merging; and c of merging
+        self._factors = from_numpy(mi.Float, [
+            (c.light_paths**2, (c.light_paths > 0) * c.connections**2, c.merges, s)
+            for c, s in zip(candidates, shared)
+        ])  # fmt: skip
+        self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
+        self._by_value = dr.zeros(mi.Float, 2 * self._count * blocks * BINS)
+        dr.eval(self._sums, self._by_value)
+
+    @dr.syntax
+    def add(
+        self, brought, mis, rivals, pixel, active, count: float = 1.0, is_joined: bool = False
+    ) -> None:
+        """Adds a contribution.
+
+        Parameters:
+            brought: The contribution, with its MIS weight ``mis``.
+            rivals: Densities of techniques, that which found it included.
+            pixel: Where it is.
+            count: MIS weights count so many such contributions as one sample.
+            is_joined: Did a connection of a camera path to a light path find it?
+        """
+        active &= brought > 0
+        square = count * dr.square(brought) / mis
+        block = pixel
+        if self._block_of is not None:
+            block = dr.gather(mi.UInt32, self._block_of, pixel, active)
+        index = mi.UInt32(0)
+        while index < mi.UInt32(self._count):
+            factors = dr.gather(mi.Vector4f, self._factors, index)
+            inverse, image, is_possible = _split(factors, rivals, dr.rcp(mis), is_joined)
+            moment = square * inverse
+            is_found = active & dr.isfinite(moment)
+            place = 2 * (index * mi.UInt32(self._pixels) + pixel)
+            dr.scatter_add(self._sums, moment, place, is_found)
+            dr.scatter_add(self._sums, brought * image, place + 1, is_found)
+            value_bin = dr.select(is_possible, bin_of(moment / brought), BINS - 1)
+            place = index * mi.UInt32(self._blocks) + block
+            place = 2 * (place * mi.UInt32(BINS) + value_bin)
+            dr.scatter_add(self._by_value, brought, place, is_found)
+            dr.scatter_add(self._by_value, moment, place + 1, is_found)
+            index += 1
+
+    def taken(self) -> tuple[np.ndarray, np.ndarray]:
+        """The sums, [candidate, pixel, 2]; and those of light and second moment by the value of
+        contributions, [candidate, block, bin, 2]."""
+        by_value = self._by_value.numpy().reshape(self._count, self._blocks, BINS, 2)
+        return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value
+
+
+def _split(
+    factors: mi.Vector4f, rivals: Rivals, total: mi.Float, is_joined: bool
+) -> tuple[mi.Float, mi.Float, mi.Bool]:
+    """Σ cᵢ qᵢ³ / (Σ qᵢ²)² in units of the technique that found a path; the MIS weight of the light
+    image; and whether the candidate can find the path. ``total`` is Σ qᵢ² of all techniques."""
+    connections, image = rivals.by_kind
+    hit, next_event = (dr.square(q) for q in rivals.by_camera)
+    merging = dr.maximum(total - (hit + next_event + connections + image), 0)
+    squares = [
+        hit, next_event, factors.x * image, factors.y * connections, factors.z * merging
+    ]  # fmt: skip
+    largest = squares[0]
+    for square in squares[1:]:
+        largest = dr.maximum(largest, square)
+    # In units of the largest one: powers would be too small for floats
+    inverse = dr.select(largest > 0, dr.rcp(largest), 0)
+    shares = [square * inverse for square in squares]
+    cubes = [share * dr.sqrt(share) for share in shares]
+    # Connections: that which found the path, whose own MIS weight is left out of the estimate
+    cubes[3] = mi.Float(0)
+    if is_joined:
+        own = factors.y * inverse
+        cubes[3] = own * dr.sqrt(own) * total
+    cubes[-1] *= factors.w
+    whole = dr.maximum(_sum(shares), 1)
+    found = _sum(cubes) / dr.square(whole) * dr.sqrt(inverse)
+    return found, shares[2] / whole, largest > 0
+
+
+def _sum(values: list[mi.Float]) -> mi.Float:
+    return sum(values[1:], values[0])

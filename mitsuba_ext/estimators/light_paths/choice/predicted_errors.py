@@ -1,0 +1,92 @@
+"""The errors of renders with other techniques, as a pilot predicts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ....planning.benefit import gain_of, trimmed_batches
+from ....planning.pixel_estimates import relative_scale
+from .path_moments import Estimate
+
+#: Light is missing if so many of its contributions are expected in all pixels of a render: one
+#: render in a thousand holds one.
+_LEAST = 1e-3
+
+#: The pixels that ``trimmed`` leaves out, as comparisons do.
+_LEFT_OUT = 1e-3
+
+#: Less light than this share is not missing: densities of paths become too small for floats.
+_NOTHING = 1e-6
+
+
+@dataclass(frozen=True)
+class PredictedErrors:
+    """For each candidate, figures relative to ``path``, [candidate] each.
+
+    The error of a pixel is divided by the square of the mean radiance of the pixel and its
+    neighbours.
+
+    Attributes:
+        variances: The expected squared error of a render of this length. Light that a candidate
+            cannot find counts as missing, by its square; so does what hardly any render finds.
+        trimmed: The same, without the brightest contributions, which one pixel in a thousand holds.
+        long_run: The variance: the error of long renders. Of a candidate that cannot find some
+            light, it is infinite; if ``path`` cannot, those of all others are 0.
+        missed: The share of the light that is missing in ``variances``.
+        uncertainty: The standard error of the logarithm of ``variances``.
+        of_path: The squared error of each pixel with ``path``, for one sample: that of the render,
+            times the number of samples.
+        of_image: The mean of that over the image, relative to the squared radiance of the pixels;
+            and the same without the brightest contributions.
+    """
+
+    variances: np.ndarray
+    trimmed: np.ndarray
+    long_run: np.ndarray
+    missed: np.ndarray
+    uncertainty: np.ndarray
+    of_path: np.ndarray
+    of_image: tuple[float, float]
+
+    @classmethod
+    def of(cls, estimate: Estimate, width: int, spp: int, pixel_count: int) -> PredictedErrors:
+        """Those of a render.
+
+        Parameters:
+            estimate: What the pilot has found.
+            width: Pixels of a row of the pilot's film.
+            spp, pixel_count: Samples per pixel of the render, and its number of pixels.
+        """
+        # Wider neighbourhoods would judge the pixels of a lamp by the wall behind it
+        scale = relative_scale(estimate.mean.reshape(-1, width), 1).ravel()
+        shares = _LEAST / pixel_count, _LEFT_OUT
+        (whole, missed), (trimmed, _) = estimate.errors_of_render(scale, spp, shares)
+        of_image = tuple(float((x[0] * scale**2).mean()) for x in (whole, trimmed))
+        variances, uncertainty = _relative_to_all(whole, scale)
+        trimmed, _ = _relative_to_all(trimmed, scale)
+        long_run, _ = _relative_to_all(estimate.variances, scale)
+        misses = estimate.never_found() > _NOTHING
+        if misses[0]:
+            long_run = np.where(misses, 1.0, 0.0)
+        else:
+            long_run = np.where(misses, np.inf, long_run / long_run[0])
+        variances, trimmed = variances / variances[0], trimmed / trimmed[0]
+        return cls(variances, trimmed, long_run, missed, uncertainty, whole[0], of_image)
+
+
+def _relative_to_all(
+    squared_errors: list[np.ndarray], scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each candidate, the relative squared error in units of that of all techniques, and the
+    standard error of the logarithm of this ratio."""
+    weight = scale**2
+    everything = squared_errors[1] * weight
+    # Here the batches are of pixels, not of paths
+    found = [
+        gain_of(trimmed_batches(everything, error * weight - everything))
+        for error in squared_errors
+    ]
+    gains, uncertainty = np.array(found).T
+    return 1 / np.maximum(1 - gains, 1e-6), uncertainty

@@ -1,0 +1,121 @@
+"""Observers that are told the contributions of each technique of bidirectional path tracing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mitsuba as mi
+
+from ....transport.estimator import CameraRays, Sample
+from ....transport.observer import Observer, Observers
+from ..partial_sums import Rivals, Sums
+from .candidates import Available
+
+
+class TechniqueObserver(Observer):
+    """Is told the contributions of each technique. The walk reports the contributions of camera
+    paths alone (s = 0 and 1) by the methods of :class:`Observer`.
+
+    Attributes:
+        compares: Should the methods be given ``rivals``? They take three words of each stored
+            vertex. (They are ``()`` otherwise.)
+    """
+
+    compares = False
+    can_be_frozen = False
+
+    def start(self, rays: CameraRays, available: Available) -> None:
+        """A pass begins, with these camera rays, and with all techniques that are available. The
+        values reported for camera paths are radiance: the importance of the rays has yet to
+        multiply them. The values of splats include it."""
+
+    def joined(
+        self,
+        s: mi.UInt32,
+        t: mi.UInt32,
+        value: mi.Spectrum,
+        mis: mi.Float,
+        rivals: Rivals | tuple[()],
+        active: mi.Bool,
+    ) -> None:
+        """The camera path in each lane was connected to a light path (s, t ≥ 2). This adds
+        ``value`` to its radiance, the MIS weight ``mis`` included."""
+
+    def splatted(
+        self,
+        s: mi.UInt32,
+        position: mi.Point2f,
+        value: mi.Spectrum,
+        mis: mi.Float,
+        rivals: Rivals | tuple[()],
+        active: mi.Bool,
+    ) -> None:
+        """Vertices of light paths were connected to the sensor (t = 1). This adds ``value``, the
+        MIS weight ``mis`` included, at a position on the film (``Splats``)."""
+
+    def merged(
+        self, value: mi.Spectrum, mis: mi.Float, rivals: Rivals | tuple[()], active: mi.Bool
+    ) -> None:
+        """The camera path in each lane was merged with a light path. This adds ``value`` to its
+        radiance, the MIS weight ``mis`` included."""
+
+    def photon(
+        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
+    ) -> None:
+        """The camera path in each lane was merged with a vertex of a light path, whose partial sums
+        are ``sums``; merging is the only technique. This adds ``value`` to its radiance.
+        ``carried`` is the flux of the light path, times the throughput of the camera path if it
+        goes on along the light path."""
+
+    def searched(self, count: mi.UInt32) -> None:
+        """At a vertex of the camera path in each lane, so many vertices were looked at."""
+
+    def weighed(self, by_kind: mi.Vector2f) -> None:
+        """A technique of camera paths alone has been weighed; its contribution is reported next
+        (``emission``, ``connection``). ``by_kind`` is that of :class:`Rivals`."""
+
+    def traced(self, camera: Sample, whole: Sample) -> None:
+        """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
+        light paths included; ``whole`` those of all techniques."""
+
+
+class TechniqueObservers(Observers):
+    """Passes each call on to several observers."""
+
+    def __init__(self, observers: Sequence[TechniqueObserver]) -> None:
+        super().__init__(observers)
+        self._techniques = observers
+        self.compares = any(o.compares for o in observers)
+
+    def start(self, rays: CameraRays, available: Available) -> None:
+        for observer in self._techniques:
+            observer.start(rays, available)
+
+    def joined(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.joined(*arguments)
+
+    def splatted(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.splatted(*arguments)
+
+    def merged(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.merged(*arguments)
+
+    def photon(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.photon(*arguments)
+
+    def searched(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.searched(*arguments)
+
+    def weighed(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.weighed(*arguments)
+
+    def traced(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.traced(*arguments)

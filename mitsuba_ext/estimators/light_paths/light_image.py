@@ -1,0 +1,157 @@
+"""The light image: stored vertices of light paths, connected to the sensor (t = 1)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.estimator import CameraRays, Splats
+from ...transport.frozen import frozen
+from ...transport.heroes import Heroes
+from ...transport.numbers import Numbers, hashed_2d
+from ...transport.path_decisions import SceneQuery
+from ...util.arrays import joined
+from .choice.technique_observer import TechniqueObserver
+from .light_vertices import LightVertices
+from .partial_sums import PartialSums, Rivals, weight
+from .scattering import evaluate, geometric_cosine
+from .sensor import ConnectableSensor, is_occluded
+
+
+class LightImage:
+    """Connects vertices of light paths to the sensor. It uses a kernel of its own, which has a lane
+    for each vertex.
+
+    The sum of a pixel's splats, divided by the number of its camera samples, is their contribution
+    to the pixel's radiance.
+
+    It draws one random number if the sensor has an aperture, and none otherwise.
+
+    Parameters:
+        scene: The scene.
+        sensor: The sensor to which the vertices are connected.
+        numbers: The source of random numbers.
+        rays: The camera rays of the pass. A light path's splats are multiplied by the importance of
+            the camera ray in its lane (if their number differs, rays must have equal importance).
+        sums: Computes MIS weights. If it is ``None``, the weights are 1.
+        query: Intersects rays with the scene.
+        hides_emitters: Are area lights invisible to the sensor?
+        least_depth: Least number of segments between the light and a vertex that is connected.
+        observer: Is told the splats.
+        light_paths: Number of light paths for each camera path.
+
+    Attributes:
+        shadow_count: Number of shadow rays traced.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: ConnectableSensor,
+        numbers: Numbers,
+        rays: CameraRays,
+        sums: PartialSums | None = None,
+        query: SceneQuery | None = None,
+        hides_emitters: bool = False,
+        least_depth: int = 1,
+        observer: TechniqueObserver | None = None,
+        light_paths: float = 1.0,
+    ) -> None:
+        self._share = dr.opaque(mi.Float, 1 / light_paths)
+        self._least_depth = least_depth
+        self._observer = observer
+        self._scene, self._sensor, self._importance = scene, sensor, rays.importance
+        self._sums, self._query = sums, query or SceneQuery()
+        self._hides_emitters = hides_emitters
+        # Hashed with the depth of a vertex, it gives the numbers that choose a point of the
+        # aperture
+        self._seed = None
+        if sensor.needs_aperture_sample:
+            self._seed = mi.UInt32(numbers.next_1d() * 4294967040.0)
+            dr.schedule(self._seed)
+        dr.schedule(self._importance)
+        self._found: list[Splats] = []
+        self.shadow_count = mi.UInt32(0)
+
+    def kernel_state(self) -> tuple:
+        """The objects and constants that kernels depend on."""
+        return (
+            self._least_depth, self._scene, self._sensor, self._importance, self._sums,
+            self._query, self._hides_emitters, self._seed, self._share, self._observer,
+        )  # fmt: skip
+
+    def add(self, vertices: LightVertices) -> None:
+        """Connects these vertices, at least one. It evaluates the result, so that the vertices'
+        memory can be freed."""
+        can_be_frozen = self._observer is None or self._observer.can_be_frozen
+        connect = self._connect_frozen if can_be_frozen else self._connect
+        found, tested = connect(vertices, *vertices.lanes())
+        dr.eval(found, tested)
+        self._found.append(found)
+        self.shadow_count += dr.sum(tested)
+
+    def splats(self) -> list[Splats]:
+        """All splats in one list, so that the film adds them by the same kernel for any number of
+        rounds. They are evaluated: otherwise the first reader would evaluate them together with
+        everything else that is scheduled."""
+        if len(self._found) < 2:
+            return self._found
+        return [joined(self._found)]
+
+    def _connect(
+        self, vertices: LightVertices, slot: mi.UInt32, active: mi.Bool
+    ) -> tuple[Splats, mi.UInt32]:
+        """The splats, and the number of shadow rays of each vertex."""
+        vertex = vertices.at(slot, active)
+        si = vertex.si
+        sample = mi.Point2f(0.5)
+        if self._seed is not None:
+            word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
+            sample = hashed_2d(word, vertex.depth)
+        connection, lens_weight = self._sensor.connect(si, sample, active)
+        active = active & connection.active
+        if self._least_depth > 1:
+            active &= vertex.depth >= self._least_depth
+        if self._hides_emitters:
+            active &= si.shape.emitter() == None  # noqa: E711
+        to_camera = si.to_local(connection.d)
+        heroes = Heroes(self._scene)
+        value, reverse_pdf = evaluate(
+            heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
+        )
+        importance = connection.importance * lens_weight
+        value *= vertex.β * (importance * self._share)
+        mis, rivals = mi.Float(1), ()
+        if self._sums is not None:
+            active &= self._sums.is_open(si, to_camera)
+            # The density per area with which a camera ray finds the vertex, divided by the density
+            # of this point of the aperture
+            found = importance * geometric_cosine(si, to_camera)
+            others = self._sums.others(found, vertex.sums, reverse_pdf)
+            mis = weight(others / self._sums.image_count)
+            if self._sums.splits:
+                ends = found, vertex.sums, reverse_pdf, vertex.depth == 1
+                kinds = self._sums.by_kind(*ends) / self._sums.image_count
+                rivals = Rivals(self._sums.by_camera(*ends), kinds)
+            value *= mis
+        # A connection that cannot contribute needs no shadow ray
+        active &= dr.max(dr.abs(value)) > 0
+        tested = mi.UInt32(dr.select(active, 1, 0))
+        active &= ~is_occluded(
+            self._query, self._scene, si, connection, active, self._hides_emitters
+        )
+        if not isinstance(self._importance, float):
+            importance = self._importance
+            if dr.width(importance) > 1:
+                importance = dr.gather(type(importance), importance, vertex.lane, active)
+            value *= importance
+        finite = active & dr.all(dr.isfinite(value))
+        if self._observer is not None:
+            self._observer.splatted(
+                vertex.depth + 1, connection.position, value, mis, rivals, finite
+            )
+        return Splats(
+            value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane
+        ), tested
+
+    _connect_frozen = frozen(_connect)

@@ -1,0 +1,367 @@
+"""The traced random walk of light paths, which stores its vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...startup.garbage import garbage_left_alone
+from ...transport.estimator import CameraRays
+from ...transport.free_flight import Distances
+from ...transport.frozen import frozen
+from ...transport.heroes import Heroes
+from ...transport.media import NoMedia, media_of
+from ...transport.numbers import Numbers, copied, go_to, reached, schedule_state
+from ...transport.path_decisions import Roulette, SceneQuery
+from ...transport.vertex import Arrival, PathState, Vertex
+from .emission import EmittedRay, LightEmission
+from .light_directions import LightDirections
+from .light_media import medium_at_start
+from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
+from .partial_sums import PartialSums, Sums
+from .photons.photon_history import PhotonHistory
+from .scattering import cosine_of_delta, delta_correction, evaluate, geometric_cosine
+
+#: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
+#: of all paths would take more than this number of bytes.
+STRIDE, _STORE_BYTES = 4, 1 << 29
+
+#: Largest number of rounds: a path that is still alive is stuck where nothing absorbs light.
+_MOST_ROUNDS = 1 << 12
+
+
+@dataclass
+class LightPaths:
+    """The state of the light paths, one in each lane, at a vertex that is not stored yet.
+
+    Attributes:
+        ray, pi: The ray that led to the vertex, and its intersection.
+        emitted: Radiance / density of the emitted ray.
+        β: Throughput up to the vertex, without emission.
+        sampling_weight: See :class:`~mitsuba_ext.transport.vertex.PathState`.
+        sums: Partial sums of the MIS weights: at the first vertex, those of the vertex; later,
+            those of the direction that led to it (:meth:`PartialSums.leave`).
+        depth: Segments between the light and the vertex.
+        hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
+        scatter_count: Rays traced in directions that were sampled from a BSDF.
+        inside: The state between two vertices (``transport/media.py``); ``()`` without media.
+        active: Paths that have not ended.
+    """
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    emitted: mi.Spectrum
+    β: mi.Spectrum
+    sampling_weight: mi.Float
+    sums: Sums
+    depth: mi.UInt32
+    hero_is_alone: Any
+    scatter_count: mi.UInt32
+    inside: Any
+    active: mi.Bool
+
+
+@dataclass
+class LightWalk:
+    """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
+
+    It works in rounds: :meth:`begin` emits rays; each :meth:`advance` walks a limited number of
+    vertices and returns them; :meth:`run` walks until all paths have ended.
+
+    A path draws 6 random numbers for the emitted ray and 4 for each bounce; in scenes with media,
+    more.
+
+    Parameters:
+        emission: Samples the rays with which paths begin.
+        max_depth: Longest path from light to sensor, in segments: vertices up to the depth
+            ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
+        rr_depth: Depth at which Russian roulette begins.
+        sums: Computes partial sums of MIS weights; ``None`` if they are not needed. In scenes with
+            media, a :class:`HiddenLight`.
+        roulette: The Russian roulette. It is given the throughput without the light's power, since
+            dim lights are already chosen rarely.
+        query: Intersects rays with the scene.
+        stored_lobes: Flags of BSDFs: vertices are stored where the BSDF has one of these
+            (``None``: a smooth one). For ``sums``, other vertices are as specular ones.
+        outside: The medium outside of all boundaries, in scenes with media (:func:`outer_medium`).
+            ``None`` if paths pass through media as through a vacuum.
+    """
+
+    emission: LightEmission
+    max_depth: int
+    rr_depth: int
+    sums: PartialSums | PhotonHistory | None = None
+    roulette: Roulette = field(default_factory=Roulette)
+    query: SceneQuery = field(default_factory=SceneQuery)
+    stored_lobes: int | None = None
+    outside: mi.MediumPtr | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """The layout of the stored vertices."""
+        sums, spectrum = self.sums, dr.size_v(mi.Spectrum)
+        is_whole = self.emission.needs_whole_interaction
+        if sums is None:
+            return Layout(spectrum, 0, is_whole)
+        has_region = sums.selection is not None
+        return Layout(spectrum, 5 if sums.splits else 2, is_whole, has_region)
+
+    def begin(
+        self,
+        scene: mi.Scene,
+        numbers: Numbers,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        active: mi.Bool,
+    ) -> LightPaths:
+        """Emits a ray in each lane, and traces it.
+
+        Parameters:
+            time, wavelengths: Time and wavelengths of each path: as the camera path in its lane.
+            active: Lanes that emit.
+        """
+        paths, place = self._begin(scene, numbers, time, wavelengths, active)
+        go_to(numbers, place)
+        return paths
+
+    @frozen
+    def _begin(self, scene, numbers, time, wavelengths, active) -> tuple[LightPaths, Any]:
+        numbers = copied(numbers)
+        with garbage_left_alone():
+            active = mi.Bool(active) & (self.max_depth > 1)
+            emitted = self.emission.sample(numbers, time, wavelengths, active)
+            active &= dr.max(emitted.weight) > 0
+            ray, inside = self._launch(scene, numbers, emitted, active)
+            pi = self.query.closest(scene, ray, coherent=False, active=active)
+            active &= self._media(scene).meets(pi, inside)
+            sums = Sums(mi.Float(0), mi.Float(0))
+            if self.sums is not None:
+                si = self.query.interaction(pi, emitted.ray)
+                sums = self.sums.first(scene, emitted, si, active)
+            width = dr.width(emitted.ray)
+            # As wide as in later rounds, and in all renders: kernels would differ
+            ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
+            paths = LightPaths(
+                ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
+                dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
+                Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
+            )  # fmt: skip
+            if not isinstance(paths.hero_is_alone, tuple):
+                paths.hero_is_alone = dr.zeros(mi.Bool, width)
+            return paths, reached(numbers)
+
+    def advance(
+        self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
+    ) -> tuple[LightVertices, LightPaths]:
+        """Walks up to ``stride`` more vertices. It evaluates ``paths``, so that rounds share a
+        kernel.
+
+        Returns:
+            The vertices whose BSDF has a smooth part, or that lie in a medium, and the new state of
+            the paths.
+        """
+        schedule_state(numbers)
+        # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
+        dr.make_opaque(paths)
+        dr.eval(paths)
+        store = VertexStore(self.layout, dr.width(paths.active), stride)
+        time, wavelengths = paths.ray.time, paths.ray.wavelengths
+        paths, place = self._go_on(scene, numbers, paths, store)
+        go_to(numbers, place)
+        # In the same kernel: evaluating the sampler's state later would trace the walk again
+        schedule_state(numbers)
+        dr.eval(paths, store.words, store.is_taken)
+        disperses = not isinstance(paths.hero_is_alone, tuple)
+        return LightVertices(store, time, wavelengths, disperses), paths
+
+    def run(
+        self,
+        scene: mi.Scene,
+        numbers: Numbers,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        active: mi.Bool,
+        take: Callable[[LightVertices], None],
+    ) -> mi.UInt32:
+        """Traces light paths until all have ended. ``take`` is called with the vertices of each
+        round that has any: ``STRIDE`` of a path at most. The other parameters are those of
+        :meth:`begin`.
+
+        Returns:
+            For each path, the rays traced in directions that were sampled from a BSDF.
+        """
+        paths = self.begin(scene, numbers, time, wavelengths, active)
+        dr.eval(paths)
+        bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout)
+        stride = min(STRIDE, max(1, _STORE_BYTES // bytes_per_place))
+        for _ in range(_MOST_ROUNDS):
+            vertices, paths = self.advance(scene, numbers, paths, stride)
+            if vertices.count > 0:
+                take(vertices)
+            if not dr.any(paths.active)[0]:
+                break
+        return paths.scatter_count
+
+    @frozen
+    def _go_on(self, scene, numbers, paths, store) -> tuple[LightPaths, Any]:
+        with garbage_left_alone():
+            numbers, paths = self._trace(scene, copied(numbers), paths, store)
+        return paths, reached(numbers)
+
+    @dr.syntax
+    def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
+        heroes, media, directions = Heroes(scene), self._media(scene), self._directions()
+        ctx = heroes.context()
+        ctx.mode = mi.TransportMode.Importance
+        place = dr.arange(mi.UInt32, store.lanes) * store.stride
+        # No vertex of a path is stored beyond this place
+        end = place + store.stride
+        last_depth = dr.opaque(mi.UInt32, self.max_depth - 1)
+        rr_depth = dr.opaque(mi.UInt32, self.rr_depth)
+        # A copy: the mask of the loop is not that of the paths
+        active = mi.Bool(paths.active)
+
+        while dr.hint(active, label="light walk"):
+            si = self.query.interaction(paths.pi, paths.ray)
+            si, β, in_medium = media.fly(paths.inside, numbers, paths.ray, si, paths.β, active)
+            bsdf = si.bsdf(paths.ray)
+            vertex = Vertex(si, bsdf, paths, None, in_medium)
+            sums = self._arrive(paths, si)
+
+            # ----- Store the vertex if it can be connected -----
+            store.write(
+                place, si, paths.emitted * media.arriving(β, vertex), sums, paths.depth,
+                paths.hero_is_alone, self._is_stored(media, vertex, active),
+            )  # fmt: skip
+            place += 1
+
+            # ----- Sample the BSDF -----
+            active_next = self._goes_on(media, vertex, last_depth, active)
+            sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
+            bs, weight = directions.sample(bsdf, ctx, si, sample_1, sample_2, active_next)
+            weight, sums, hero_count, hero_is_alone = self._scatter(
+                heroes, paths, bsdf, si, bs, weight, sums, active_next
+            )
+            bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            if dr.hint(media.exist and self.sums is not None, mode="scalar"):
+                sums = self.sums.scatter(sums, vertex, bs)
+            β = β * weight
+            sampling_weight = paths.sampling_weight * hero_count
+
+            # ----- Russian roulette -----
+            carries = dr.max(β) != 0  # False for NaN in Dr.Jit
+            depth = media.depth_behind(bs, paths.depth)
+            active_next = media.is_within(depth, self.max_depth, active_next)
+            rr_active = depth >= rr_depth
+            survival = self._survival(paths, si, bsdf, β, sampling_weight, depth, hero_is_alone,
+                                      active_next & rr_active & carries)
+            rr_continue = numbers.next_1d() < survival
+            active_next &= (~rr_active | rr_continue) & carries
+            β[rr_active] *= dr.rcp(survival)
+
+            # ----- Move on to the next vertex -----
+            ray = self.query.starts.along(si, si.to_world(bs.wo))
+            inside = media.cross(paths.inside, si, ray.d)
+            ray, inside = media.launch(inside, numbers, CameraRays(ray), ray, active_next)
+            pi = self.query.closest(scene, ray, coherent=False, active=active_next)
+            scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
+            active_next &= media.meets(pi, inside)
+            paths = LightPaths(
+                ray, pi, paths.emitted, β, sampling_weight, sums, depth, hero_is_alone,
+                scatter_count, inside, active_next,
+            )  # fmt: skip
+            active = active_next & (place < end)
+        return numbers, paths
+
+    def _directions(self) -> LightDirections:
+        """The object that samples directions."""
+        # MIS weights of camera paths make up for light that the samples of BSDFs do not find
+        return LightDirections(self.emission.not_reciprocal, mixes=not self._is_weighed)
+
+    @property
+    def _is_weighed(self) -> bool:
+        """Are light paths combined with camera paths by MIS weights?"""
+        return isinstance(self.sums, PartialSums)
+
+    def _media(self, scene: mi.Scene) -> NoMedia:
+        """The object that handles media."""
+        if self.outside is None:
+            return NoMedia()
+        return media_of(scene, False, Distances())
+
+    def _launch(self, scene, numbers, emitted: EmittedRay, active) -> tuple[mi.Ray3f, Any]:
+        """An emitted ray, up to where it scatters in a medium at most, and the state there."""
+        media = self._media(scene)
+        if not media.exist:
+            return emitted.ray, ()
+        medium = medium_at_start(self.query, scene, emitted, self.outside, active)
+        rays = CameraRays(emitted.ray, medium=medium)
+        inside = media.begin(numbers, rays)
+        # States of a loop have the width of its lanes
+        inside.channel = inside.channel + dr.zeros(mi.UInt32, dr.width(medium))
+        return media.launch(inside, numbers, rays, emitted.ray, active)
+
+    def _is_stored(self, media: NoMedia, vertex: Vertex, active) -> mi.Bool:
+        """Which vertices are stored?"""
+        stored = active & self._stores(vertex.bsdf)
+        return stored | vertex.medium.scatters if media.exist else stored
+
+    def _goes_on(self, media: NoMedia, vertex: Vertex, last_depth, active) -> mi.Bool:
+        """Which paths may leave a vertex?"""
+        if media.exist:
+            return media.goes_on(vertex, self.max_depth, active)[0]
+        return active & (vertex.depth < last_depth)
+
+    def _arrive(self, paths: LightPaths, si: mi.SurfaceInteraction3f) -> Sums:
+        """The partial sums at a vertex."""
+        if self.sums is None:
+            return paths.sums
+        is_first = paths.depth == 1
+        later = self.sums.arrive(paths.sums, si, dr.square(si.t), is_first, by_light=True)
+        return Sums(
+            dr.select(is_first, paths.sums.dVCM, later.dVCM),
+            dr.select(is_first, paths.sums.dVC, later.dVC),
+            later.by_camera,
+            later.region,
+            later.count,
+            ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else (),
+            later.by_kind,
+        )
+
+    def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):
+        """The weight of a BSDF sample, the partial sums behind it, the factor of the sampling
+        weight (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        weight, hero_count, hero_is_alone = heroes.scatter(
+            paths.hero_is_alone, weight, bsdf, si, bs
+        )
+        value, reverse_pdf = evaluate(
+            heroes, paths.hero_is_alone, bsdf, si, bs.wo, active & ~is_delta
+        )
+        value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
+        weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
+        if self._is_weighed:
+            active &= self.sums.is_open(si, bs.wo)
+        if self.sums is not None and self.outside is None:
+            passes = is_delta | ~self._stores(bsdf)
+            cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
+            sums = self.sums.leave(
+                sums, cosine, bs.pdf, reverse_pdf, passes, paths.depth == 1
+            )
+        return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
+
+    def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        """Are vertices with this BSDF stored?"""
+        lobes = mi.BSDFFlags.Smooth if self.stored_lobes is None else self.stored_lobes
+        return mi.has_flag(bsdf.flags(), lobes)
+
+    def _survival(self, paths, si, bsdf, β, sampling_weight, depth, hero_is_alone, active):
+        """The survival probability of Russian roulette. η is 1, since refraction does not scale
+        the flux that light paths carry."""
+        arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(False))
+        path = PathState(β, mi.Float(1), sampling_weight, depth, arrival, hero_is_alone)
+        return self.roulette.survival((), Vertex(si, bsdf, path), path, active)[0]

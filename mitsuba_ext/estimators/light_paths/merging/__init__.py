@@ -1,0 +1,1 @@
+"""Merging of the vertices of camera paths with nearby vertices of light paths."""

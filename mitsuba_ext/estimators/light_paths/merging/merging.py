@@ -1,0 +1,299 @@
+"""Merging: the radiance at the vertices of camera paths, estimated from nearby vertices of light
+paths (photons).
+
+Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
+Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev, *Implementing
+Vertex Connection and Merging*, technical report, 2012.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ....scene.bounds import scene_bounds
+from ....transport.bsdfs import eval_bsdf
+from ....transport.heroes import Heroes
+from ....transport.path_decisions import SceneQuery, Subpaths
+from ....transport.vertex import Vertex
+from ..choice.technique_observer import TechniqueObserver
+from ..light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache, group_of
+from ..light_walk import LightWalk
+from ..partial_sums import PartialSums
+from ..scattering import geometric_cosine, reverse_density
+from .vertex_grid import VertexGrid
+
+#: Vertices merge on surfaces that face about the same way: the least cosine between their normals;
+#: and within a flat cylinder: its half height in units of its radius. Light would otherwise leak
+#: around corners and through thin walls.
+_LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
+
+#: So many vertices are found before they are evaluated. Lanes of a kernel search for different
+#: times, and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain
+#: nothing.)
+BATCH = 4
+
+#: Light paths that measure how dense vertices are, and how often the radius of that is doubled at
+#: most.
+PILOT_PATHS, DOUBLINGS = 1 << 16, 8
+
+#: The number of vertices that a disk is to hold. For MIS weights, so many vertices are one sample:
+#: they share a camera path, and other techniques often vary less than their densities tell. (With
+#: weights that count each vertex, the variance is 1.1 to 1.2 times as large in glass_lamp, pool and
+#: caustic; with fewer than a tenth of them, it stays about the same.)
+HANDFUL = 8.0
+
+#: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
+#: of a pixel, in footprints of pixels.
+FEW, WIDEST = 64, 8.0
+
+#: The largest radius of the first sample, in units of the diagonal of the scene: pixels of very
+#: small films are wide.
+LARGEST = 0.04
+
+
+def widest_radius(scene: mi.Scene, footprint: float) -> float:
+    """The largest radius of the first sample of a pixel that is ``footprint`` wide (0: of a
+    radiance meter)."""
+    largest = LARGEST * scene_diagonal(scene)
+    return min(WIDEST * footprint, largest) if footprint > 0 else largest
+
+
+def median_footprint(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> float:
+    """The width of a pixel where the camera sees the scene: the median over the film; 0 if all rays
+    of a pixel are the same (a radiance meter). If rays through a grid of places on the film hit
+    nothing, a thousandth of the diagonal of the scene."""
+    count = 64
+    lane = dr.arange(mi.UInt32, count * count)
+    position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    pi = query.closest(scene, mi.Ray3f(ray), coherent=True, active=mi.Bool(True))
+    if ray.has_differentials:
+        width = dr.norm((ray.o_x + ray.d_x * pi.t) - (ray.o + ray.d * pi.t))
+        found = width.numpy()[pi.is_valid().numpy()]
+        found = found[np.isfinite(found) & (found > 0)]
+    else:
+        found = _distances_in_pixels(scene, sensor, query, position)
+    return float(np.median(found)) if len(found) else scene_diagonal(scene) / 1000
+
+
+def _distances_in_pixels(
+    scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, position: mi.Point2f
+) -> np.ndarray:
+    """The distances between what two rays of a pixel hit, one through each of the places
+    ``position``; both use different random numbers."""
+    size = mi.Vector2f(sensor.film().crop_size())
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(0, dr.width(position))
+    pixel, points, hits = dr.floor(position * size), [], mi.Bool(True)
+    for _ in range(2):
+        ray, _ = sensor.sample_ray_differential(
+            sensor.shutter_open(), 0.5, (pixel + numbers.next_2d()) / size, numbers.next_2d()
+        )
+        ray = mi.Ray3f(ray)
+        pi = query.closest(scene, ray, coherent=False, active=hits)
+        points.append(ray(pi.t))
+        hits &= pi.is_valid()
+    distance = dr.norm(points[0] - points[1]).numpy()
+    return distance[np.broadcast_to(hits.numpy(), distance.shape)]
+
+
+def scene_diagonal(scene: mi.Scene) -> float:
+    """The diagonal of the scene's bounds; 1000 if it has no surfaces."""
+    bounds = scene_bounds(scene)
+    return float(dr.norm(bounds.extents())) if bounds.valid() else 1000.0
+
+
+def suitable_radius(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    light_walk: LightWalk,
+    footprint: float,
+    pixels: int,
+    only_caustic: bool,
+) -> float | None:
+    """The radius in which a disk holds a handful of the vertices of one light path per pixel, where
+    there are vertices on surfaces: measured by a few light paths. ``None`` if these leave too few
+    vertices.
+
+    Parameters:
+        light_walk: Traces the light paths.
+        footprint: The width of a pixel where the camera sees the scene.
+        only_caustic: Are vertices merged only where light arrives from a delta lobe?
+    """
+    vertices = pilot_vertices(scene, sensor, light_walk)
+    if vertices is None:
+        return None
+    kept = None if light_walk.outside is None else vertices.is_on_surface
+    if only_caustic:
+        kept = vertices.is_caustic
+    least = 2 * footprint or scene_diagonal(scene) / 500
+    return disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, least)
+
+
+def pilot_vertices(
+    scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk
+) -> VertexCache | None:
+    """The vertices of ``PILOT_PATHS`` light paths; ``None`` if there are none."""
+    rounds: list[LightVertices] = []
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, 0), PILOT_PATHS)
+    # Times and wavelengths are those of rays of the sensor
+    numbers = sampler.next_2d()
+    rays, _ = sensor.sample_ray_differential(
+        sensor.shutter_open() + numbers.x * sensor.shutter_open_time(), numbers.y,
+        mi.Point2f(0.5), mi.Point2f(0.5),
+    )  # fmt: skip
+    light_walk.run(
+        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, PILOT_PATHS),
+        lambda vertices: rounds.append(PackedVertices(vertices)),
+    )  # fmt: skip
+    if not rounds:
+        return None
+    return VertexCache(rounds, PILOT_PATHS)
+
+
+def disk_radius(
+    vertices: VertexCache,
+    kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None,
+    count: float,
+    least: float,
+) -> float | None:
+    """The radius in which a disk around a vertex holds ``count`` vertices, on average over the
+    vertices. ``None`` if there are too few of them to tell.
+
+    Parameters:
+        kept: See :class:`VertexGrid`.
+        least: The radius, at least, of the disks that are looked at.
+    """
+    for doublings in range(DOUBLINGS):
+        radius = least * 2**doublings
+        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
+        if grid.count < FEW:
+            return None
+        others = grid.occupancy
+        if others > 4:
+            break
+    # Cubes cut squares of two radii out of a surface
+    per_area = max(others, 1e-6) / (4 * radius**2)
+    return math.sqrt(count / (math.pi * per_area))
+
+
+def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
+    """The stack with ``value`` on top (first). The last element is dropped."""
+    return [dr.select(active, new, old) for new, old in zip([value, *stack[:-1]], stack)]
+
+
+class MergedSubpaths(Subpaths):
+    """Adds to each vertex of a camera path what light paths bring to the vertices near it.
+
+    Parameters:
+        vertices: The vertices of the light paths, at least one.
+        grid: Finds them.
+        sums: Computes the MIS weights; ``None`` if merging is the only technique that finds what it
+            finds.
+        heroes: Joins the wavelengths of two paths.
+        max_depth: Longest path in segments.
+        paths: Number of light paths that a vertex can be merged with.
+        shares_rays: Are vertices merged only with those of paths of the same time and wavelengths?
+            ``grid`` then has these groups.
+        others: Other techniques at the same vertices; ``None`` if there are none.
+        observer: Is told what merging adds.
+    """
+
+    def __init__(
+        self,
+        vertices: VertexCache,
+        grid: VertexGrid,
+        sums: PartialSums | None,
+        heroes: Heroes,
+        max_depth: int,
+        paths: int,
+        shares_rays: bool = False,
+        others: Subpaths | None = None,
+        observer: TechniqueObserver | None = None,
+    ) -> None:
+        self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
+        self._heroes, self._ctx, self._observer = heroes, heroes.context(), observer
+        self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
+        # The density of light paths, for one vertex within the radius
+        self._per_vertex = dr.rcp(self._measure(grid.radius) * dr.opaque(mi.Float, paths))
+        dr.make_opaque(self._per_vertex)
+
+    def _measure(self, radius: mi.Float) -> mi.Float:
+        """The area in which vertices are found."""
+        return dr.pi * dr.square(radius)
+
+    @dr.syntax
+    def gather(self, scene, sampler, vertex, active):
+        total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
+        if dr.hint(self._others is not None, mode="scalar"):
+            total, shadow_count = self._others.gather(scene, sampler, vertex, active)
+        merges = active & self._is_merged(vertex)
+        merged = mi.Spectrum(0)
+        state, si = self._grid.begin(), vertex.si
+        group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
+        near, looked = [mi.UInt32(0) for _ in range(BATCH)], mi.UInt32(0)
+        while dr.hint(merges, label="merge"):
+            count, searches = mi.UInt32(0), mi.Bool(merges)
+            while dr.hint(searches, label="search"):
+                state, index, found, merges = self._grid.next(state, si.p, searches, group)
+                near = pushed(near, index, found)
+                count += dr.select(found, 1, 0)
+                looked += 1
+                searches = merges & (count < BATCH)
+            exists = count > 0
+            while dr.hint(exists, label="evaluate"):
+                merged += self._merged(vertex, self._vertices.at(near[0], exists), exists)
+                near = near[1:] + near[:1]
+                count -= 1
+                exists = count > 0
+        total += merged * vertex.path.β * self._per_vertex
+        if dr.hint(self._observer is not None, mode="scalar"):
+            self._observer.searched(looked)
+        return total, shadow_count
+
+    def _is_merged(self, vertex: Vertex) -> mi.Bool:
+        """Where is light gathered?"""
+        return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+
+    def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
+        """BSDF · flux of one light path, with the MIS weight."""
+        si, far = vertex.si, other.si
+        active = active & (vertex.depth + other.depth + 1 <= self._max_depth)
+        height = dr.abs(dr.dot(si.n, far.p - si.p))
+        if self._shares_rays:
+            active &= (far.time == si.time) & dr.all(far.wavelengths == si.wavelengths)
+        active &= height < _HALF_HEIGHT * self._grid.radius
+        active &= dr.dot(si.n, far.n) > _LEAST_COSINE
+        wo = si.to_local(far.to_world(far.wi))
+        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
+        value = si.to_world_mueller(value, -wo, si.wi)
+        value = self._heroes.merge(
+            vertex.path.hero_is_alone, other.hero_is_alone, value, vertex.bsdf, si, wo
+        )
+        # Flux arrives per area of the surface; the value holds the shading cosine
+        arrives = geometric_cosine(far, far.wi)
+        value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
+        mis, rivals = mi.Float(1), ()
+        if self._sums is not None:
+            reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+            ends = other.sums, pdf, vertex.path.sums, reverse
+            mis = self._sums.merging_weight(*ends)
+            value *= mis
+            if self._sums.splits:
+                is_first = other.depth == 1, vertex.depth == 0
+                rivals = self._sums.merging_rivals(*ends, is_first)
+        active &= dr.all(dr.isfinite(value))
+        if self._observer is not None:
+            brought = value * vertex.path.β * self._per_vertex
+            if self._sums is None:
+                carried = value * vertex.path.β * (arrives / pdf)
+                self._observer.photon(brought, carried, other.sums, active & (pdf > 0))
+            else:
+                self._observer.merged(brought, mis, rivals, active)
+        return dr.select(active, value, 0)

@@ -1,0 +1,388 @@
+"""Partial sums that a subpath carries along, from which the MIS weights of complete paths are
+computed: weights over all bidirectional techniques.
+
+Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012: the
+quantities dVCM and dVC, without merging. All ratios of densities are raised to the exponent of the
+MIS heuristic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.path_decisions import EmitterSampling, SubpathSelection
+from .both_ends import from_both_ends
+from .scattering import geometric_cosine
+
+if TYPE_CHECKING:
+    from .emission import EmittedRay
+
+
+@dataclass
+class Sums:
+    """The partial sums of a subpath at its last vertex (Eqs. 31 to 36 of the report).
+
+    Attributes:
+        dVCM: 1 / density of the last vertex, times the number of samples of the technique that
+            connects the last two vertices. At the first vertex, instead, times the ratio of the
+            densities with which next event estimation and emission sample the point on the light.
+        dVC: The sum over the techniques that connect earlier vertices of the subpath.
+        by_camera: Only for light paths, from the second vertex on, and if :class:`PartialSums`
+            computes it: the two terms of dVC in which a camera path finds the whole path (s = 0 and
+            1), not raised to the exponent.
+        by_kind: Only if :class:`PartialSums` computes it: the parts of dVC of connections (s, t ≥
+            2), and of the light image (t = 1; only for camera paths).
+        region, count: Only if the light path vertices for connections are chosen by regions
+            (otherwise ``()``): the region of the last vertex; and the factor of ``dVCM`` where the
+            technique that connects the last two vertices is such a connection.
+        is_caustic: Only for light paths: was the direction that led to the last vertex sampled
+            from a delta lobe?
+    """
+
+    dVCM: mi.Float
+    dVC: mi.Float
+    by_camera: mi.Vector2f | tuple[()] = ()
+    region: Any = ()
+    count: Any = ()
+    is_caustic: Any = ()
+    by_kind: mi.Vector2f | tuple[()] = ()
+
+    @property
+    def last(self) -> mi.Float:
+        """``dVCM``, times ``count`` if vertices are chosen by regions."""
+        return self.dVCM if isinstance(self.count, tuple) else self.dVCM * self.count
+
+
+@dataclass
+class Rivals:
+    """How densely the other techniques find a path that one technique has found: by kind, in units
+    of the density of that technique times the number of its samples.
+
+    Attributes:
+        by_camera: The densities of camera paths alone (s = 0 and 1).
+        by_kind: The sum over connections (s, t ≥ 2), and that of the light image (t = 1), raised to
+            the exponent of the MIS heuristic.
+    """
+
+    by_camera: mi.Vector2f
+    by_kind: mi.Vector2f
+
+
+class PartialSums:
+    """Computes the sums along light paths and camera paths.
+
+    Parameters:
+        next_event: The decision that samples points on lights for next event estimation at the
+            vertices of camera paths.
+        connections: The average fraction of the vertices of a light path to which a vertex of a
+            camera path is connected (s, t ≥ 2). Camera paths are connected to the light (s = 1) and
+            hit it (s = 0) once.
+        exponent: 1 for the balance heuristic, 2 for the power heuristic.
+        splits: Are ``by_camera`` and ``by_kind`` of :class:`Sums` computed?
+        selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
+            regions multiplies ``connections``. ``None`` if the choice is uniform.
+        merging: The density of merging at a vertex, relative to the product of the densities with
+            which both subpaths sample it: π r² · number of light paths, or in proportion to that.
+            ``None`` if vertices are not merged.
+        merges_all: Are vertices merged wherever their BSDF is smooth? If not, only where light
+            arrives from a delta lobe.
+        light_paths: Number of light paths for each camera path: so often, on average, a light path
+            is connected to the sensor (t = 1).
+        has_clear_curves: Does light pass through a curve (``scene/bsdfs.py``)?
+    """
+
+    def __init__(
+        self,
+        next_event: EmitterSampling,
+        connections: mi.Float | float = 1.0,
+        exponent: int = 2,
+        splits: bool = False,
+        selection: SubpathSelection | None = None,
+        merging: mi.Float | None = None,
+        merges_all: bool = False,
+        light_paths: mi.Float | float = 1.0,
+        has_clear_curves: bool = False,
+    ) -> None:
+        self._next_event, self.exponent, self.selection = next_event, exponent, selection
+        self.splits = splits
+        #: ``connections``, raised to the exponent.
+        self.count = self.ratio(mi.Float(connections))
+        #: ``light_paths``, raised to the exponent.
+        self.image_count = self.ratio(mi.Float(light_paths))
+        #: ``merging``, raised to the exponent.
+        self.merging = None if merging is None else self.ratio(merging)
+        self.merges_all = merges_all
+        self._has_clear_curves = has_clear_curves
+
+    def cosine(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
+        """The geometric cosine of a local direction; 0 where no light path comes from there, or
+        goes there: into a curve."""
+        return dr.select(self.is_open(si, d), geometric_cosine(si, d), 0)
+
+    def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
+        """Does a local direction lead anywhere but into a curve, which is left to camera paths?"""
+        if not self._has_clear_curves:
+            return mi.Bool(True)
+        kind = si.shape.shape_type()
+        curves = mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
+        is_curve = (kind == int(curves[0])) | (kind == int(curves[1]))
+        return ~is_curve | (dr.dot(si.n, si.to_world(d)) > 0)
+
+    def ratio(self, x: mi.Float) -> mi.Float:
+        """A ratio of densities, raised to the exponent."""
+        return dr.square(x) if self.exponent == 2 else x
+
+    def root(self, ratio: mi.Float) -> mi.Float:
+        """The inverse of :meth:`ratio`."""
+        return dr.sqrt(ratio) if self.exponent == 2 else ratio
+
+    def first(
+        self, scene: mi.Scene, emitted: EmittedRay, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> Sums:
+        """At the first vertex after the light, ``si``."""
+        is_delta = emitted.is_delta_position | emitted.is_delta_direction
+        chosen = emitted.probability * emitted.pdf_position * emitted.pdf_direction
+        # Densities per area, at the vertex (``arrives``) and at the light (``leaves``)
+        arrives = chosen * _cosine(si) / dr.select(emitted.is_infinite, 1, dr.square(si.t))
+        connected = self._connection_density(scene, emitted, si, active)
+        leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
+        connected *= dr.select(is_delta, 1, leaves)
+        inverse = dr.select(arrives > 0, dr.rcp(arrives), 0)
+        sums = self.begin(
+            self.ratio(connected * inverse),
+            dr.select(is_delta, 0, self.ratio(leaves * inverse)),
+        )
+        if self.splits:
+            sums.by_camera = dr.zeros(mi.Vector2f, dr.width(inverse))
+        return sums
+
+    def begin(self, dVCM: mi.Float, dVC: mi.Float) -> Sums:
+        """The sums where a subpath begins."""
+        sums, lanes = Sums(dVCM, dVC), dr.width(dVCM)
+        if self.splits:
+            sums.by_kind = dr.zeros(mi.Vector2f, lanes)
+        if self.selection is not None:
+            sums.region, sums.count = dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes)
+        return sums
+
+    def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
+        """For a technique that connects a subpath's last vertex to something: the sum over all
+        techniques that sample this vertex from the other side, of the ratio of their density to
+        that of the technique.
+
+        Parameters:
+            density: Density with which the other side samples the vertex, divided by the density
+                of the technique (per area, where the technique itself has density 1).
+            reverse_pdf: Density, per solid angle, of continuing from there to the previous vertex
+                of the subpath.
+        """
+        others = sums.last + self.ratio(reverse_pdf) * sums.dVC
+        if self.merging is not None and self.merges_all:
+            others += self.merging
+        elif self.merging is not None and not isinstance(sums.is_caustic, tuple):
+            others += dr.select(sums.is_caustic, self.merging, 0)
+        return self.ratio(density) * others
+
+    def merging_weight(
+        self, light: Sums, pdf: mi.Float, camera: Sums, reverse_pdf: mi.Float
+    ) -> mi.Float:
+        """The MIS weight of merging the last vertices of two subpaths. The sums over the other
+        techniques that merge (dVM in the report) are dVC / ``merging``.
+
+        Parameters:
+            pdf: Density, per solid angle, with which the camera path goes on to the vertex of the
+                light path before the last one.
+            reverse_pdf: Density with which the light path goes on to the vertex of the camera path
+                before the last one.
+        """
+        others = light.last + self.ratio(pdf) * light.dVC
+        others += camera.last + self.ratio(reverse_pdf) * camera.dVC
+        return weight(others / self.merging)
+
+    def merging_rivals(
+        self,
+        light: Sums,
+        pdf: mi.Float,
+        camera: Sums,
+        reverse_pdf: mi.Float,
+        is_first: tuple[mi.Bool, mi.Bool],
+    ) -> Rivals:
+        """Those of merging. The parameters are those of :meth:`merging_weight`; ``is_first`` tells
+        whether the light path's, and the camera path's vertex is its first one."""
+        inverse, one = dr.rcp(self.merging), mi.Float(1)
+        kinds = self.by_kind(one, light, pdf, is_first[0])
+        kinds += self.by_kind(one, camera, reverse_pdf, is_first[1])
+        return Rivals(
+            self.by_camera(self.root(inverse), light, pdf, is_first[0]), kinds * inverse
+        )
+
+    def merging_before(
+        self, sums: Sums, squared_distance: mi.Float, cosine: mi.Float
+    ) -> mi.Float | float:
+        """For a camera path that leaves a vertex by a delta lobe: the term of dVC there for merging
+        at the vertex before, to which light then comes from that lobe.
+
+        Parameters:
+            sums: At the vertex that is left.
+            squared_distance, cosine: Of the segment to the vertex before, and there with the
+                geometric normal.
+        """
+        if self.merging is None or self.merges_all:
+            return 0.0
+        # dVCM is 0 if the vertex before was left by a delta lobe too
+        ratio = self.ratio(cosine / squared_distance)
+        return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * self.merging, 0)
+
+    def _connection_density(self, scene, emitted, si, active) -> mi.Float:
+        """The density with which next event estimation at ``si`` samples the point on the light:
+        per solid angle, or the probability of choosing the light if it is a point or a
+        direction."""
+        place = self._next_event.visit(
+            self._next_event.begin(None, emitted.ray), scene, si, active
+        )
+        # The density of the BSDF sample is not known here: decisions that use it cannot be combined
+        # with light paths
+        d = -emitted.ray.d
+        state = self._next_event.remember(place, scene, d, mi.Float(0), active)
+        start, ds = emitted.start, dr.zeros(mi.DirectionSample3f, dr.width(si))
+        ds.p, ds.n, ds.uv, ds.time = start.p, start.sh_frame.n, start.uv, si.time
+        ds.d, ds.dist, ds.emitter = -emitted.ray.d, si.t, emitted.emitter
+        ds.dist = dr.select(emitted.is_infinite, ds.dist, dr.norm(start.p - si.p))
+        ref = mi.Interaction3f(si)
+        is_delta = emitted.is_delta_position | (
+            emitted.is_delta_direction & emitted.is_infinite
+        )
+        is_beam = emitted.is_delta_direction & ~emitted.is_infinite
+        density = self._next_event.density(
+            state, scene, ref, start, ds, active & ~is_delta & ~is_beam
+        )
+        if not _has_delta(scene):
+            return density
+        probability = self._next_event.probability(
+            state, scene, ref, emitted.index, active & is_delta
+        )
+        return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
+
+    def arrive(
+        self,
+        sums: Sums,
+        si: mi.SurfaceInteraction3f,
+        squared_distance: mi.Float,
+        is_first: mi.Bool,
+        by_light: bool,
+    ) -> Sums:
+        """The sums at the next vertex, ``si``, at this distance: densities per solid angle become
+        densities per area.
+
+        Parameters:
+            is_first: Is ``si`` the first vertex of the subpath?
+            by_light: Is it a light path?
+        """
+        inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
+        region, count = (), ()
+        if self.selection is not None:
+            region = self.selection.region(from_both_ends(si), si.is_valid())
+            ends = (region, sums.region) if by_light else (sums.region, region)
+            expected = self.selection.expected(*ends, si.is_valid() & ~is_first)
+            # The first vertex is connected to the light or the sensor, which has no region
+            count = dr.select(is_first, 1, self.ratio(expected))
+        return Sums(
+            sums.dVCM * self.ratio(squared_distance * inverse),
+            sums.dVC * self.ratio(inverse),
+            () if isinstance(sums.by_camera, tuple) else sums.by_camera * inverse,
+            region,
+            count,
+            by_kind=sums.by_kind * self.ratio(inverse) if self.splits else (),
+        )
+
+    def leave(
+        self,
+        sums: Sums,
+        cosine: mi.Float,
+        pdf: mi.Float,
+        reverse_pdf: mi.Float,
+        is_delta: mi.Bool,
+        is_first: mi.Bool | bool,
+    ) -> Sums:
+        """The sums behind a vertex, after a direction was sampled there.
+
+        Parameters:
+            cosine: Between the direction and the geometric normal, not negative; behind a delta
+                lobe, :func:`cosine_of_delta`.
+            pdf, reverse_pdf: Density of the direction, and of the reverse direction through the
+                vertex, per solid angle.
+            is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.
+            is_first: Is this the first vertex of the subpath?
+        """
+        leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
+        smooth = self.others(leaves, sums, reverse_pdf)
+        # The technique that connects the segment behind this vertex is one with s, t ≥ 2
+        dVCM = self.count * self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
+        return Sums(
+            dr.select(is_delta, 0, dVCM),
+            dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
+            self._leave_by_camera(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
+            sums.region,
+            sums.count,
+            by_kind=self._leave_by_kind(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
+        )
+
+    def by_kind(
+        self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
+    ) -> mi.Vector2f | tuple[()]:
+        """The parts of :meth:`others` (whose parameters these are) of connections and of the light
+        image. ``()`` if ``splits`` is not set."""
+        if not self.splits:
+            return ()
+        # What connects to the first vertex: the sensor for a camera path, a light for a light path
+        is_camera = isinstance(sums.by_camera, tuple)
+        last = dr.select(is_first, mi.Vector2f(0, 1 if is_camera else 0), mi.Vector2f(1, 0))
+        return self.ratio(density) * (
+            last * sums.last + self.ratio(reverse_pdf) * sums.by_kind
+        )
+
+    def _leave_by_kind(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
+        smooth = self.by_kind(leaves, sums, reverse_pdf, is_first)
+        if isinstance(smooth, tuple):
+            return ()
+        return dr.select(is_delta, sums.by_kind * self.ratio(cosine), smooth)
+
+    def by_camera(
+        self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
+    ) -> mi.Vector2f | tuple[()]:
+        """The densities with which a camera path alone finds the whole path (s = 0 and 1), each
+        divided by that of connecting to the last vertex of the light path. The parameters are those
+        of :meth:`others`; the ratios are not raised to the exponent. ``()`` if ``splits`` is not
+        set."""
+        if isinstance(sums.by_camera, tuple):
+            return ()
+        first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))
+        return density * dr.select(is_first, first, reverse_pdf * sums.by_camera)
+
+    def _leave_by_camera(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
+        smooth = self.by_camera(leaves, sums, reverse_pdf, is_first)
+        if isinstance(smooth, tuple):
+            return ()
+        hit = mi.Vector2f(self.root(sums.dVC), 0)
+        return dr.select(
+            is_delta, dr.select(is_first, hit, sums.by_camera) * cosine, smooth
+        )
+
+
+def weight(others: mi.Float) -> mi.Float:
+    """The MIS weight of a technique, from the sum of the other techniques' density ratios to it."""
+    return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
+
+
+def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
+    """Between the direction of arrival and the geometric normal."""
+    return dr.abs(dr.dot(si.n, si.to_world(si.wi)))
+
+
+def _has_delta(scene: mi.Scene) -> bool:
+    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
+    return any(int(e.flags()) & delta for e in scene.emitters())

@@ -1,0 +1,197 @@
+"""The estimator of bidirectional path tracing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...scene.movers import movers
+from ...transport.estimator import CameraRays, Sample
+from ...transport.frozen import frozen
+from ...transport.heroes import Heroes
+from ...transport.numbers import BothEnds, Numbers, copied, go_to, reached
+from ...transport.observer import Observers
+from ...transport.path_decisions import SubpathSelection
+from ...transport.walk import Walk
+from ...transport.without_lengths import WithoutLengths
+from .choice.candidates import Available
+from .choice.technique_observer import TechniqueObserver
+from .connections import LightSubpaths
+from .emission import LightEmission
+from .light_image import LightImage
+from .light_numbers import LightPathRays
+from .light_vertices import LightVertices, PackedVertices, VertexCache
+from .light_walk import LightWalk
+from .merging.merging import HANDFUL, MergedSubpaths
+from .merging.merging_radius import MergingRadius
+from .merging.vertex_grid import VertexGrid
+from .partial_sums import PartialSums
+from .sensor import ConnectableSensor
+from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
+from .weights import BidirectionalWeights
+
+#: The number of vertices of a light path that MIS weights assume. The true number would make the
+#: weights depend on the samples. (door_ajar: 11 % less variance than with 1.)
+_VERTICES = 2.5
+
+#: The number of connections that MIS weights assume where there are none: dVCM, which holds it,
+#: must not be 0, which stands for a delta lobe.
+_NONE = 1e-9
+
+
+@dataclass
+class BidirectionalPathTracer:
+    """Traces a camera path and a light path in each lane; it is an :class:`Estimator`. The camera
+    path is traced by a :class:`Walk`, with any decisions.
+
+    Parameters:
+        walk: Traces the camera paths.
+        emission: Samples the rays with which light paths begin.
+        sensor: The sensor to which light paths are connected; ``None`` to leave out this technique.
+        connections: Number of light path vertices to which each camera path vertex is connected, or
+            0.
+        selection: Chooses the regions from which these vertices are taken. Paths of different
+            wavelengths or times cannot be connected. Where these differ between lanes, the choice
+            is always uniform among the vertices of the light path in the same lane.
+        observer: Is told the contributions of each technique, also by the walk.
+        is_alone: Must the sample in a lane not depend on other lanes? If so, camera paths are
+            connected to the light path in the same lane only.
+        skips_direct: Are paths of one and two segments left out?
+        radius: Within what radius vertices are merged; ``None`` if they are not.
+        merges_all: See :class:`PartialSums`.
+        light_paths: Number of light paths for each camera path. It must be 1 where paths of
+            different lanes cannot be connected (see ``selection`` and ``is_alone``).
+        most_lanes: The most lanes that it should have, for the memory of what it stores; 0 for any
+            number.
+    """
+
+    walk: Walk
+    emission: LightEmission
+    sensor: ConnectableSensor | None
+    connections: int
+    selection: SubpathSelection = field(default_factory=SubpathSelection)
+    observer: TechniqueObserver | None = None
+    is_alone: bool = False
+    skips_direct: bool = False
+    radius: MergingRadius | None = None
+    merges_all: bool = False
+    light_paths: float = 1.0
+    most_lanes: int = 0
+
+    def __call__(
+        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        walk = self.walk
+        own_lane = self.is_alone or mi.is_spectral or bool(movers(scene))
+        selects = self.selection.count > 0 and self.connections > 0 and not own_lane
+        selection = self.selection if selects else None
+        # Connections per vertex of a light path. A selection divides by the number of vertices
+        # itself, in ``expected``
+        count = self.connections if selection else self.connections / _VERTICES or _NONE
+        observer, splits = self.observer, False
+        if observer is not None:
+            observer.start(rays, Available(
+                self.sensor is not None, self.connections > 0, self.radius, not own_lane,
+                self.most_lanes,
+            ))  # fmt: skip
+            walk = replace(walk, observer=Observers([walk.observer, observer]))
+            splits = observer.compares
+        lanes = dr.width(rays.ray)
+        light = LightPathRays.of(sampler, rays, self.light_paths)
+        per_camera_path = light.count / lanes
+        radius, merging = None, None
+        if self.radius is not None:
+            # Of paths of different times or wavelengths, those of one sample of each pixel merge
+            paths = min(lanes, self.radius.pixels) if own_lane else light.count
+            radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
+            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
+            dr.make_opaque(merging)
+        sums = PartialSums(
+            walk.next_event, dr.opaque(mi.Float, count), splits=splits,
+            selection=selection, merging=merging, merges_all=self.merges_all,
+            light_paths=dr.opaque(mi.Float, per_camera_path),
+            has_clear_curves=self.emission.has_clear_curves,
+        )  # fmt: skip
+        image = None
+        if self.sensor is not None:
+            numbers = sampler if light.count == lanes else light.numbers
+            image = LightImage(
+                scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
+                2 if self.skips_direct else 1, observer, per_camera_path,
+            )  # fmt: skip
+        light_walk = LightWalk(
+            self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
+        )
+        # Evaluated now, since later kernels of the pass read the rays again
+        dr.schedule(rays)
+        rounds: list[LightVertices] = []
+
+        def take(vertices: LightVertices) -> None:
+            if image is not None:
+                image.add(vertices)
+            rounds.append(PackedVertices(vertices))
+
+        scatter_count = light_walk.run(
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active), take
+        )
+        splats = image.splats() if image is not None else []
+        weights = BidirectionalWeights(scene, sums, self.emission, self.sensor, observer)
+        if self.skips_direct:
+            weights = WithoutLengths(weights, 1, 2)
+        subpaths = None
+        if rounds:
+            vertices = VertexCache(rounds, light.count)
+            if selection is not None:
+                choice = RegionChoice(vertices, selection)
+            else:
+                choice = OwnVertexChoice(vertices) if own_lane else VertexChoice(vertices)
+            if self.connections > 0:
+                subpaths = LightSubpaths(
+                    scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
+                    walk.observer, observer,
+                )  # fmt: skip
+            if radius is not None:
+                kept = None if self.merges_all else vertices.is_caustic
+                grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
+                subpaths = MergedSubpaths(
+                    vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
+                    observer,
+                )  # fmt: skip
+        if isinstance(sampler, BothEnds):
+            sampler = sampler.camera
+        sample = camera_paths(
+            replace(walk, mis=weights, subpaths=subpaths), scene, sampler, rays, active
+        )
+        # The first lane counts all rays that are not those of the path in a lane
+        is_first = dr.arange(mi.UInt32, lanes) == 0
+        shadow_count = sample.shadow_count
+        if image is not None:
+            shadow_count = shadow_count + dr.select(is_first, image.shadow_count, 0)
+        scatter_count = light.by_camera_path(scatter_count, lanes)
+        whole = replace(
+            sample, splats=splats, scatter_count=sample.scatter_count + scatter_count,
+            shadow_count=shadow_count,
+        )  # fmt: skip
+        if observer is not None:
+            observer.traced(sample, whole)
+        return whole
+
+
+def camera_paths(
+    walk: Walk, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+) -> Sample:
+    """The samples of ``walk``, whose kernels are recorded, where nobody observes what cannot be."""
+    if not walk.observer.can_be_frozen:
+        return walk(scene, sampler, rays, active)
+    sample, place = _walked(walk, scene, sampler, rays, mi.Bool(active))
+    go_to(sampler, place)
+    return sample
+
+
+@frozen
+def _walked(walk: Walk, scene, sampler, rays, active) -> tuple[Sample, Any]:
+    numbers = copied(sampler)
+    return walk(scene, numbers, rays, active), reached(numbers)

@@ -1,0 +1,221 @@
+"""Photons in participating media: vertices at which light paths scatter there, merged with points
+of camera paths that lie in a ball around them.
+
+The light that arrives at x and is scattered towards the camera, Σ f_p β / (N · 4/3 π r³), is summed
+over the vertices in a ball of radius r, of N light paths: their density is proportional to the
+radiance times the coefficient of scattering, which the light walk divides out of β.
+
+In homogeneous media, a camera ray passes through, and gathers light at a few points on its way. In
+others, it scatters where a collision is sampled, and gathers light there.
+
+Source: H. W. Jensen, P. H. Christensen, *Efficient Simulation of Light Transport in Scenes with
+Participating Media Using Photon Maps*, SIGGRAPH 1998; C. Knaus, M. Zwicker, *Progressive Photon
+Mapping: A Probabilistic Approach*, ACM Transactions on Graphics 30(3), 2011, section 6.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ....transport.free_flight import Distances, attenuation, component, extinction, interaction_at
+from ....transport.heroes import Heroes
+from ....transport.media import eval_phase
+from ....transport.path_decisions import Subpaths
+from ....transport.vertex import PathState, Vertex
+from ..choice.technique_observer import TechniqueObserver
+from ..light_vertices import LightVertex, VertexCache, group_of
+from ..light_walk import LightWalk
+from ..merging.merging import (
+    BATCH,
+    DOUBLINGS,
+    FEW,
+    HANDFUL,
+    LARGEST,
+    PILOT_PATHS,
+    MergedSubpaths,
+    pilot_vertices,
+    pushed,
+    scene_diagonal,
+)
+from ..merging.vertex_grid import VertexGrid
+
+#: The number of points at which a ray gathers light on its way through a homogeneous medium. (In
+#: volume_caustic, 64 samples: 1 has 0.82 of the efficiency, 2 0.97, 8 0.88, 16 0.67.)
+_POINTS = 4
+
+#: The largest radius of a ball, in footprints of pixels.
+_WIDEST_BALL = 20.0
+
+
+def widest_ball(scene: mi.Scene, footprint: float) -> float:
+    """The largest radius of a ball, where a pixel is ``footprint`` wide (0: a radiance meter)."""
+    largest = LARGEST * scene_diagonal(scene)
+    return min(_WIDEST_BALL * footprint, largest) if footprint > 0 else largest
+
+
+class PassesThrough(Distances):
+    """Camera rays pass through homogeneous media: :meth:`MergedInMedia.along` finds the light that
+    is scattered there."""
+
+    scatter = False
+
+
+class MergedInMedia(MergedSubpaths):
+    """Adds to camera paths what light paths bring to their surroundings in participating media.
+
+    Parameters:
+        vertices, grid, heroes, max_depth, paths, shares_rays: See :class:`MergedSubpaths`.
+        others: The light at surfaces.
+        has_grids: May there be media that are not homogeneous?
+        observer: See :class:`MergedSubpaths`.
+    """
+
+    def __init__(
+        self,
+        vertices: VertexCache,
+        grid: VertexGrid,
+        heroes: Heroes,
+        max_depth: int,
+        paths: int,
+        shares_rays: bool,
+        others: Subpaths,
+        has_grids: bool,
+        observer: TechniqueObserver | None = None,
+    ) -> None:
+        super().__init__(
+            vertices, grid, None, heroes, max_depth, paths, shares_rays, others, observer
+        )
+        self._has_grids = has_grids
+
+    def gather(self, scene, sampler, vertex, active):
+        if not self._has_grids:
+            return self._others.gather(scene, sampler, vertex, active)
+        return super().gather(scene, sampler, vertex, active)
+
+    @dr.syntax
+    def along(self, sampler, ray, si, inside, path, active):
+        medium = inside.medium
+        searches = active & (medium != None)  # noqa: E711
+        searches &= medium.is_homogeneous()
+        σ = extinction(medium, ray, searches)
+        chosen = component(σ, inside.channel)
+        searches &= chosen > 0
+        mei = interaction_at(ray, ray.o, medium)
+        σ_s, _, _ = medium.get_scattering_coefficients(mei, searches)
+        # Distances are exponentially distributed, up to the surface
+        scattered = _absorbed(dr.select(searches, chosen * si.t, 0))
+        sample, number = sampler.next_1d(searches), mi.UInt32(0)
+        t = _distance(number, sample, scattered, chosen)
+        σ_s = mi.Spectrum(σ_s)
+        weight = σ_s * dr.select(chosen > 0, scattered / chosen, 0)
+        weight *= path.β * (self._per_vertex / _POINTS)
+        gathered, state = mi.Spectrum(0), self._grid.begin()
+        group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
+        near = [mi.UInt32(0) for _ in range(BATCH)]
+        far, looked = [mi.Float(0) for _ in range(BATCH)], mi.UInt32(0)
+        while dr.hint(searches, label="merge along a ray"):
+            count, fills = mi.UInt32(0), mi.Bool(searches)
+            while dr.hint(fills, label="search"):
+                state, index, found, goes_on = self._grid.next(state, ray(t), fills, group)
+                near, far = pushed(near, index, found), pushed(far, t, found)
+                count += dr.select(found, 1, 0)
+                looked += 1
+                # Go on to the next point
+                ends = fills & ~goes_on
+                number += dr.select(ends, 1, 0)
+                state = dr.select(ends, self._grid.begin(), state)
+                t = dr.select(ends, _distance(number, sample, scattered, chosen), t)
+                searches &= ~ends | (number < _POINTS)
+                fills &= searches & (count < BATCH)
+            exists = count > 0
+            while dr.hint(exists, label="evaluate"):
+                other = self._vertices.at(near[0], exists)
+                value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
+                gathered += value
+                if dr.hint(self._observer is not None, mode="scalar"):
+                    carried = path.β * σ_s * other.β
+                    self._observer.photon(value * weight, carried, other.sums, exists)
+                near, far = near[1:] + near[:1], far[1:] + far[:1]
+                count -= 1
+                exists = count > 0
+        if dr.hint(self._observer is not None, mode="scalar"):
+            self._observer.searched(looked)
+        return gathered * weight
+
+    def _measure(self, radius):
+        return 4 / 3 * dr.pi * radius * radius * radius
+
+    def _is_merged(self, vertex):
+        return vertex.medium.scatters
+
+    def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
+        value = self._flux(vertex.medium.mei, vertex.path, other, active)
+        if self._observer is not None:
+            σ_s, _, _ = vertex.medium.mei.medium.get_scattering_coefficients(
+                vertex.medium.mei, active
+            )
+            brought = value * vertex.path.β * self._per_vertex
+            carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
+            self._observer.photon(brought, carried, other.sums, active)
+        return value
+
+    def _flux(
+        self, mei: mi.MediumInteraction3f, path: PathState, other: LightVertex, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Phase function · flux of one light path."""
+        far = other.si
+        active = active & (path.depth + other.depth + 1 <= self._max_depth)
+        if self._shares_rays:
+            active &= (far.time == mei.time) & dr.all(far.wavelengths == mei.wavelengths)
+        wo = far.to_world(far.wi)
+        value = mi.Spectrum(eval_phase(mei, wo, active)[0])
+        value = self._heroes.merge(
+            path.hero_is_alone, other.hero_is_alone, value, dr.zeros(mi.BSDFPtr), far, far.wi
+        )
+        value *= other.β
+        active &= dr.all(dr.isfinite(value))
+        return dr.select(active, value, 0)
+
+
+def _absorbed(τ: mi.Float) -> mi.Float:
+    """1 − exp(−τ), without cancellation."""
+    return dr.select(τ < 0.01, τ * (1 - 0.5 * τ * (1 - τ / 3)), 1 - dr.exp(-τ))
+
+
+def _distance(number: mi.UInt32, sample: mi.Float, scattered: mi.Float, σ: mi.Float) -> mi.Float:
+    """The distance of a point: the inverse of 1 − exp(−σ t) at evenly spaced places."""
+    x = (mi.Float(number) + sample) / _POINTS * scattered
+    τ = dr.select(x < 0.01, x * (1 + 0.5 * x * (1 + x / 1.5)), -dr.log(1 - x))
+    return dr.select(σ > 0, τ / σ, 0)
+
+
+def suitable_ball(
+    scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, footprint: float, pixels: int
+) -> float | None:
+    """The radius in which a ball holds a handful of the vertices of one light path per pixel: the
+    median over the vertices in media, since they are dense without bounds near small lamps.
+    Measured by a few light paths; ``None`` if these leave too few vertices in media.
+
+    Parameters:
+        light_walk: Traces the light paths.
+        footprint: The width of a pixel where the camera sees the scene.
+    """
+    vertices = pilot_vertices(scene, sensor, light_walk)
+    if vertices is None:
+        return None
+    least = 2 * footprint or scene_diagonal(scene) / 500
+    for doublings in range(DOUBLINGS):
+        radius = least * 2**doublings
+        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), vertices.is_in_medium)
+        if grid.count < FEW:
+            return None
+        others = grid.median_occupancy
+        if others > 4:
+            break
+    per_volume = max(others, 1e-6) / (2 * radius) ** 3
+    count = HANDFUL * PILOT_PATHS / pixels
+    found = (count / (4 / 3 * math.pi * per_volume)) ** (1 / 3)
+    return min(found, widest_ball(scene, footprint))

@@ -1,0 +1,138 @@
+"""The estimator of progressive photon mapping: merging alone.
+
+Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
+Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*,
+ACM Transactions on Graphics 30(3), 2011 (passes are independent of each other).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ....scene.media import may_have_grids
+from ....scene.movers import movers
+from ....transport.estimator import CameraRays, Sample
+from ....transport.heroes import Heroes
+from ....transport.numbers import Numbers
+from ....transport.path_decisions import Roulette, Weights
+from ....transport.walk import Walk
+from ..choice.technique_observer import TechniqueObserver
+from ..light_numbers import LightPathRays
+from ..light_vertices import Layout, LightVertices, PackedVertices, VertexCache, bytes_per_vertex
+from ..light_walk import STRIDE, LightWalk
+from ..merging.merging import MergedSubpaths
+from ..merging.merging_radius import MergingRadius
+from ..merging.vertex_grid import VertexGrid
+from .medium_photons import MergedInMedia, PassesThrough
+
+#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
+#: stored at a time.
+_PASS_BYTES, _PATH_BYTES = 1 << 29, 512
+
+
+def most_lanes(light_paths: float) -> int:
+    """The most camera paths in a pass, with so many light paths for each."""
+    layout = Layout(len(mi.Spectrum()), 0, True)
+    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
+    return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
+
+
+class OnlySpecular(Roulette):
+    """Ends a path where it was scattered by a lobe that is not a delta distribution."""
+
+    def survival(self, state, vertex, path, active):
+        return dr.select(path.arrival.is_delta, mi.Float(1), 0), state
+
+
+class FoundByCamera(Weights):
+    """Nothing else finds the lights that a camera path hits by way of mirrors and clear glass."""
+
+    def emission(self, scene, si, ds, path, pdf):
+        return mi.Float(1)
+
+
+@dataclass
+class PhotonMapper:
+    """Traces light paths, and camera paths up to the first vertex that they can be merged with; it
+    is an :class:`Estimator`.
+
+    Parameters:
+        walk: Traces the camera paths; it makes no connections.
+        light_walk: Traces the light paths.
+        radius: Within what radius vertices on surfaces are merged.
+        ball: Within what radius vertices in media are merged; ``None`` without media.
+        light_paths: Number of light paths for each camera path; 1 in spectral variants and with
+            moving shapes.
+        observer: Is told of the passes, and of the vertices that are looked at.
+    """
+
+    walk: Walk
+    light_walk: LightWalk
+    radius: MergingRadius
+    ball: MergingRadius | None = None
+    light_paths: float = 1.0
+    observer: TechniqueObserver | None = None
+
+    @property
+    def most_lanes(self) -> int:
+        """The most camera paths in a pass."""
+        return most_lanes(self.light_paths)
+
+    def of_coarse_film(self, pixel_width: float) -> PhotonMapper:
+        """That of a film with fewer pixels, each as wide as ``pixel_width`` of them."""
+        return replace(
+            self,
+            radius=self.radius.of_coarse_film(pixel_width),
+            ball=self.ball and self.ball.of_coarse_film(pixel_width),
+        )
+
+    def __call__(
+        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        dr.schedule(rays)
+        if self.observer is not None:
+            self.observer.camera(rays)
+        lanes = dr.width(rays.ray)
+        light = LightPathRays.of(sampler, rays, self.light_paths)
+        rounds: list[LightVertices] = []
+        scatter_count = self.light_walk.run(
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active),
+            lambda vertices: rounds.append(PackedVertices(vertices)),
+        )  # fmt: skip
+        walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
+        if rounds:
+            if self.ball is not None:
+                walk.distance = PassesThrough()
+            vertices = VertexCache(rounds, light.count)
+            walk = replace(walk, subpaths=self._merged(scene, vertices, light.count))
+        sample = walk(scene, sampler, rays, active)
+        scatter_count = light.by_camera_path(scatter_count, lanes)
+        whole = replace(sample, scatter_count=sample.scatter_count + scatter_count)
+        if self.observer is not None:
+            self.observer.traced(sample, whole)
+        return whole
+
+    def _merged(self, scene: mi.Scene, vertices: VertexCache, count: int) -> MergedSubpaths:
+        """Adds the light of photons, from ``count`` light paths, to camera paths."""
+        # Of paths of different times or wavelengths, those of one sample of each pixel merge
+        groups = mi.is_spectral or bool(movers(scene))
+        group = vertices.group if groups else None
+        paths = min(count, self.radius.pixels) if groups else count
+        radius = dr.opaque(mi.Float, self.radius.next(paths, count // paths))
+        kept = None if self.ball is None else vertices.is_on_surface
+        grid = VertexGrid(vertices, radius, kept, group)
+        heroes, max_depth = Heroes(scene), self.walk.max_depth
+        merged = MergedSubpaths(
+            vertices, grid, None, heroes, max_depth, paths, groups, None, self.observer
+        )
+        if self.ball is None:
+            return merged
+        radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
+        grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
+        return MergedInMedia(
+            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene),
+            self.observer,
+        )  # fmt: skip

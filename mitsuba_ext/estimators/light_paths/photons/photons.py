@@ -1,0 +1,58 @@
+"""Photon mapping for the scene of an integrator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+
+from ....scene.bsdfs import refuse_clear_curves
+from ....scene.media import may_have_media
+from ....transport.path_decisions import NoConnections
+from ....transport.walk import Walk
+from ..emission import LightEmission
+from ..light_media import outer_medium
+from ..light_walk import LightWalk
+from ..merging.merging_parameters import MergingParameters
+from .photon_mapper import PhotonMapper
+
+if TYPE_CHECKING:
+    from ....bases.walk_integrator import WalkIntegrator
+
+
+def photon_mapper(
+    integrator: WalkIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    merging: MergingParameters,
+    radius_in_media: float = 0.0,
+    light_paths: float = 1.0,
+) -> PhotonMapper:
+    """The estimator of progressive photon mapping, for a scene that has lights, with the parameters
+    of an integrator. A few light paths measure the radii that are 0.
+
+    Parameters:
+        merging, radius_in_media, light_paths: See :class:`sppm`.
+
+    Raises:
+        NotImplementedError: A light cannot emit light paths, or light passes through a curve.
+    """
+    query = integrator.query(scene)
+    refuse_clear_curves(scene, f'"{integrator.name}"')
+    try:
+        emission = LightEmission(scene)
+    except NotImplementedError as error:
+        raise NotImplementedError(f'"{integrator.name}": {error}') from None
+    outside = outer_medium(query, scene, sensor) if may_have_media(scene) else None
+    light_walk = LightWalk(
+        emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
+    )
+    before = round(integrator.samples_before * light_paths)
+    radius, ball = merging.radius_of(scene, sensor, light_walk, False, before, True), None
+    if outside is not None:
+        ball = merging.ball_of(scene, sensor, light_walk, before, radius_in_media)
+    walk = Walk(
+        integrator.max_depth, integrator.rr_depth, integrator.hide_emitters,
+        next_event=NoConnections(), query=query,
+    )  # fmt: skip
+    return PhotonMapper(walk, light_walk, radius, ball, light_paths)

@@ -1,0 +1,1 @@
+"""Instant radiosity: vertices of light paths as virtual lights."""

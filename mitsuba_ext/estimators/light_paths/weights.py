@@ -1,0 +1,136 @@
+"""MIS weights of the techniques of camera paths (s = 0 and 1), in combination with light paths."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.heroes import Heroes
+from ...transport.path_decisions import Weights
+from ...transport.vertex import PathState, Vertex
+from .choice.technique_observer import TechniqueObserver
+from .emission import LightEmission
+from .partial_sums import PartialSums, Sums, weight
+from .scattering import cosine_of_delta, geometric_cosine, reverse_density
+from .sensor import ConnectableSensor
+
+
+class BidirectionalWeights(Weights):
+    """MIS weights over all bidirectional techniques: s vertices come from a light path (0: a camera
+    path hits the light; 1: next event estimation), and t from a camera path (1: a light path's
+    vertex is connected to the sensor).
+
+    Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012.
+
+    Parameters:
+        scene: The scene.
+        sums: Computes the partial sums.
+        emission: Gives the densities of the rays with which light paths begin.
+        sensor: The sensor to which light paths are connected; ``None`` to leave out t = 1.
+        observer: Is told the rivals of techniques; ``None`` if nobody asks.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sums: PartialSums,
+        emission: LightEmission,
+        sensor: ConnectableSensor | None,
+        observer: TechniqueObserver | None = None,
+    ) -> None:
+        self._ctx = Heroes(scene).context()
+        self.sums, self._emission, self._sensor = sums, emission, sensor
+        self._observer = observer if sums.splits else None
+        self._origin = mi.Point3f(0)
+
+    def kernel_state(self) -> tuple:
+        """The objects that kernels depend on."""
+        return self.sums, self._emission, self._sensor
+
+    def begin(self, ray: mi.Ray3f) -> Sums:
+        if self._sensor is None:
+            return self.sums.begin(mi.Float(0), mi.Float(0))
+        self._origin, pdf = self._sensor.origin(ray)
+        dVCM = self.sums.image_count * self.sums.ratio(dr.rcp(pdf))
+        return self.sums.begin(dVCM, dr.zeros(mi.Float, dr.width(pdf)))
+
+    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
+        is_first = path.depth == 0
+        ref = dr.select(is_first, self._origin, path.arrival.ref.p)
+        later = self.sums.arrive(
+            path.sums, si, dr.squared_norm(si.p - ref), is_first, by_light=False
+        )
+        # A ray that hits nothing keeps its density per solid angle
+        return Sums(
+            dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
+            dr.select(si.is_valid(), later.dVC, path.sums.dVC),
+            region=later.region,
+            count=later.count,
+            by_kind=later.by_kind,
+        )
+
+    def emission(self, scene, si, ds, path, pdf) -> mi.Float:
+        active = ds.emitter != None  # noqa: E711
+        position, direction = self._emission.densities(
+            scene, ds.emitter, -ds.d, self._emission.front(si), path.arrival.ref, active
+        )
+        # The density of next event estimation: per area for lights with a surface
+        found = pdf * dr.select(
+            si.is_valid(), dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist), 1
+        )
+        # dVCM holds the count of connections to light paths, but there is one to a light
+        others = self.sums.ratio(found) * path.sums.dVCM / self.sums.count
+        emitted = self.sums.ratio(position * direction)
+        others += emitted * path.sums.dVC
+        if self._observer is not None:
+            self._observer.weighed(emitted * path.sums.by_kind)
+        # No other technique finds lights that the sensor sees directly
+        return dr.select(path.depth == 0, 1, weight(others))
+
+    def connection(self, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
+        si, active = vertex.si, pdf > 0
+        wo = si.to_local(ds.d)
+        position, direction = self._emission.densities(
+            scene, ds.emitter, -ds.d, ds.n, mi.Interaction3f(si), active
+        )
+        flags = ds.emitter.flags()
+        is_point = mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+        has_area = ~is_point & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+        # The density with which a light path samples this segment, in the measure of next event
+        # estimation
+        emitted = position * direction * self.sums.cosine(si, wo)
+        emitted *= dr.select(is_point, dr.rcp(dr.square(ds.dist)), 1)
+        emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)
+        inverse = dr.select(active, dr.rcp(pdf), 0)
+        sums = vertex.path.sums
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+        others = self.sums.others(emitted * inverse, sums, reverse)
+        others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
+        if self._observer is not None:
+            self._observer.weighed(
+                self.sums.by_kind(emitted * inverse, sums, reverse, vertex.depth == 0)
+            )
+        return weight(others)
+
+    def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
+        si = vertex.si
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        active = si.is_valid() & ~is_delta
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
+        cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
+        cosine = dr.select(self.sums.is_open(si, bs.wo), cosine, 0)
+        sums = self.sums.leave(
+            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
+        )
+        if self.sums.merging is not None:
+            ref = vertex.path.arrival.ref
+            d = si.p - ref.p
+            squared = dr.squared_norm(d)
+            before = self.sums.merging_before(
+                vertex.path.sums, squared, dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared)
+            )
+            # The vertex before the first one is the sensor
+            merges = si.is_valid() & is_delta & (vertex.depth > 0) & (squared > 0)
+            sums.dVC += dr.select(merges, self.sums.ratio(cosine) * before, 0)
+        return sums
+

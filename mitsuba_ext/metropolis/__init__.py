@@ -1,1 +1,0 @@
-"""Metropolis light transport: Markov chains in primary sample space and in path space."""

@@ -1,0 +1,1 @@
+"""What a render learns, and whether it pays: learners, predictions, files of what was learned."""

@@ -1,0 +1,181 @@
+"""The parameters of a decision, as the scene gives them, and the decision or learner that they make
+for one render."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import mitsuba as mi
+
+from ..rendering.camera import film_extent
+from ..util.parameters import read_parameter
+from .learner import Learner
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The render for which a decision is made.
+
+    Attributes:
+        scene, sensor: What is rendered.
+        seed: The seed of the render.
+        max_depth, rr_depth: Longest path in segments, and depth at which roulette begins.
+        spp: Samples per pixel of the render.
+        pilot_spp: How many of these are pilot samples.
+        is_timed: Can a timeout end the render before it has all samples?
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed: int
+    max_depth: int
+    rr_depth: int
+    spp: int
+    pilot_spp: int = 0
+    is_timed: bool = False
+
+    @property
+    def pixel_count(self) -> int:
+        """Sampled pixels of the film."""
+        width, height = film_extent(self.sensor.film())
+        return width * height
+
+    @property
+    def pilot_samples(self) -> int:
+        """Samples of all pilots together."""
+        return self.pixel_count * self.pilot_spp
+
+
+class ParameterReader:
+    """Reads the parameters of a decision from those of a plugin.
+
+    Parameters:
+        plugin: The plugin's name in error messages.
+        props: The parameters that the scene gives.
+        names: The plugin's name of a parameter, by the decision's name, where they differ.
+        defaults: The plugin's own defaults.
+    """
+
+    def __init__(
+        self,
+        plugin: str,
+        props: mi.Properties,
+        names: Mapping[str, str] | None = None,
+        **defaults: Any,
+    ) -> None:
+        self.plugin, self._props = plugin, props
+        self._names, self._defaults = names or {}, defaults
+
+    def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
+        """Reads and checks a parameter: see :func:`mitsuba_ext.util.parameters.read_parameter`."""
+        name = self._names.get(key, key)
+        default = self._defaults.get(key, default)
+        return read_parameter(self.plugin, self._props, name, default, **accepted)
+
+    @classmethod
+    def of_defaults(
+        cls, plugin: str, names: Mapping[str, str] | None = None, **defaults: Any
+    ) -> ParameterReader:
+        """A reader without parameters of the scene: it returns the defaults."""
+        return cls(plugin, mi.Properties(plugin), names, **defaults)
+
+    def is_given(self, key: str) -> bool:
+        """Does the scene give this parameter?"""
+        return self._names.get(key, key) in self._props
+
+    def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
+        """Refuses parameters that the plugin has not read until now.
+
+        Parameters:
+            conditions: What each parameter needs to have an effect, by name.
+
+        Raises:
+            ValueError: The scene gives such a parameter.
+        """
+        for key, condition in conditions.items():
+            if key in self._props and not self._props.was_queried(key):
+                raise ValueError(
+                    f'"{self.plugin}": the parameter "{key}" needs {condition}; leave it out'
+                )
+
+
+#: What fills the slots of an integrator.
+Slots = Mapping[str, "DecisionParameters"]
+
+
+class DecisionParameters:
+    """The parameters of something that can replace one decision of the walk. One object serves all
+    renders: it holds no state of any of them.
+
+    Attributes:
+        name: Its name in scenes: a plugin, or a word.
+        slots: The slots of an integrator that it can fill.
+        pilot_spp: Pilot samples per pixel from which it learns, by default; 0 if it does not learn.
+        pilot_paths: How many samples of the whole film are enough to learn from; 0 if more are
+            always better.
+        doubles: Can it learn from one sample per pixel? Each pilot then has as many samples as all
+            before it.
+        tries: Does what it learns in a first pilot make the next ones better?
+        camera_paths_only: Does it need what only camera paths store at a vertex (from where it is
+            seen, its depth, the density with which BSDF sampling finds a light)?
+        sees_media: Can it decide at vertices in participating media? False if it needs a normal
+            or a BSDF.
+        sample_cost: The approximate time of a sample in units of that of a path.
+    """
+
+    name = ""
+    slots: tuple[str, ...] = ()
+    pilot_spp = 0
+    pilot_paths = 0
+    doubles = False
+    tries = False
+    camera_paths_only = False
+    sees_media = True
+    sample_cost = 1
+
+    def check_slot(self, plugin: str, slot: str) -> None:
+        """
+        Raises:
+            ValueError: It cannot fill this slot of the plugin with these parameters.
+        """
+        if slot not in self.slots:
+            raise ValueError(
+                f'"{plugin}": the parameter "{slot}" cannot be "{self.name}", which is for '
+                f"{', '.join(self.slots)}"
+            )
+
+    def check_together(self, plugin: str, slots: Slots) -> None:
+        """
+        Raises:
+            ValueError: One of these parameters has no effect with what fills the other slots.
+        """
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        """Is there something to learn in ``scene``, from ``spp`` pilot samples per pixel?"""
+        return False
+
+    def decision(self, setting: Setting) -> Any | None:
+        """The decision without learning; ``None`` for that of Mitsuba's ``path``."""
+        return None
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        """The learner of this decision, or ``None`` if it does not learn. ``others`` maps the slots
+        before this one to their learners."""
+        return None
+
+    def parameters(self, slots: Slots = MappingProxyType({})) -> dict[str, Any]:
+        """Names and values, for ``str()``, of the parameters that are not empty and have an effect
+        with what fills ``slots``."""
+        own = {key: value for key, value in vars(self).items() if not key.startswith("_")}
+        return {key: value for key, value in own.items() if value != ""}
+
+    def describe(self, slots: Slots = MappingProxyType({})) -> str:
+        """Name and :meth:`parameters`, in one line."""
+        values = ", ".join(f"{key} = {value}" for key, value in self.parameters(slots).items())
+        return f"{self.name}[{values}]" if values else self.name
+
+    def __str__(self) -> str:
+        return self.describe()

@@ -1,0 +1,23 @@
+"""Spectra as single numbers, by which lights are compared."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...util.arrays import channel_mean
+
+
+def brightness(value: mi.Spectrum) -> mi.Float:
+    """One number for a spectrum: the luminance in RGB variants, the mean of the channels (sampled
+    wavelengths) in the others."""
+    return mi.luminance(value) if mi.is_rgb else channel_mean(value)
+
+
+def comparison_wavelengths(width: int) -> mi.Spectrum:
+    """The wavelengths at which lights are compared: those of the sample 0.5 in spectral variants,
+    none in the others."""
+    wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
+    if mi.is_spectral:
+        wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
+    return wavelengths

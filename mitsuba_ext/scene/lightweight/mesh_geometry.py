@@ -1,0 +1,54 @@
+"""A mesh of Mitsuba whose triangles are found by our tree."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ...util.arrays import from_numpy
+from .geometry import Lightweight
+from .mesh_tree import MeshTree, positions_and_faces
+
+
+class MeshGeometry(Lightweight):
+    """A mesh that is in no scene of Mitsuba's.
+
+    Parameters:
+        mesh: The mesh. Its faces are sorted by the leaves of the tree.
+
+    Attributes:
+        nbytes (int): The memory of the tree.
+    """
+
+    def __init__(self, mesh: mi.Mesh) -> None:
+        self.surface = mesh
+        parameters = mi.traverse(mesh)
+        positions, faces = positions_and_faces(mesh)
+        self._tree = MeshTree(positions, faces)
+        self.nbytes = self._tree.nbytes
+        del positions
+        sort_faces(parameters, faces, self._tree.order)
+
+    def corners(self, triangle, active):
+        vertices = self.surface.face_indices(triangle, active)
+        return [self.surface.vertex_position(vertex, active) for vertex in vertices]
+
+    def closest(self, ray, active):
+        return self._tree.closest(ray, self, active)
+
+    def occluded(self, ray, active):
+        return self._tree.occluded(ray, self, active)
+
+
+def sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndarray) -> None:
+    """Sorts the triangles of a mesh into an order."""
+    for key in parameters.keys():
+        if key.startswith("face_"):
+            values = parameters[key].numpy().reshape(len(faces), -1)
+            parameters[key] = from_numpy(mi.Float, values[order])
+    parameters["faces"] = from_numpy(mi.UInt32, faces[order])
+    # As if the vertices had changed: Mitsuba then computes the areas of a light's triangles again,
+    # and keeps the normals, if there are any
+    for key in ("vertex_positions", "vertex_normals"):
+        parameters.set_dirty(key)
+    parameters.update()

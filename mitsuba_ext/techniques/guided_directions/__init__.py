@@ -1,0 +1,1 @@
+"""Path guiding in primary sample space."""

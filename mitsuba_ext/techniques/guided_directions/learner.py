@@ -1,0 +1,355 @@
+"""Learning the densities of the primary samples that choose directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...planning.benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
+from ...planning.effect import Effect
+from ...planning.learner import Learner
+from ...planning.pixel_estimates import PixelEstimates
+from ...transport.observer import Observer
+from ...transport.path_decisions import DirectionSamples, Roulette
+from ...util.stored_arrays import StoredArrays
+from .adjoint_roulette import AdjointRoulette
+from .decision import GuidedDirections, Regions
+from .path_records import BYTES_PER_RECORD, PathRecords
+from .roulette_trial import BYTES_PER_PATH, RouletteTrial
+from .sample_trees import SampleTrees
+from .surface_regions import SurfaceRegions
+
+#: The share of the samples that trees decide in the second pilot, and the shares from which one is
+#: chosen once their effects have been measured.
+_FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
+
+#: The number of bounces is chosen from at least this share of all pilots' paths.
+_LEAST_SHARE = 0.2
+
+#: The efficiency that guiding must reach. Trees built from all pilots are better than those tested,
+#: but only the last stage uses them.
+_LEAST_EFFICIENCY = 1.03
+
+#: About the number of rays per segment of a path, shadow rays included.
+_RAYS = 1.5
+
+#: The efficiency that trees of few samples must reach for learning to continue: trees of more
+#: samples are better.
+_TRIAL_EFFICIENCY = 0.95
+
+
+class Guidance(NamedTuple):
+    """How to guide, and the effect of that.
+
+    Attributes:
+        share: The share of the samples that trees decide.
+        bounces: How many directions of a path are guided.
+        gain: The relative reduction of variance.
+        efficiency: The efficiency, relative to that without a guide.
+    """
+
+    share: float
+    bounces: int
+    gain: float
+    efficiency: float
+
+
+class GuideLearner(Learner):
+    """Learns trees of primary samples in the pilots. The second pilot draws from the trees of the
+    first one, from which their efficiency is estimated: if it is too low, learning ends there. The
+    same samples determine how many bounces to guide, and the share of uniform samples.
+
+    Parameters:
+        regions: Makes the regions that have a tree each, from the scout's vertices and normals.
+        wants_scout: Does ``regions`` need these vertices?
+        bounces: How many directions of a path are guided, at most.
+        max_memory: Bytes for records, and for the trees built from them.
+        pilot_samples: Samples of all pilots together.
+        film_size: Width and height of the film in pixels, with its border where that is sampled.
+        always: Guide all ``bounces``, and learn the roulette, also where the pilots show that it
+            does not pay?
+
+    Attributes:
+        guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
+        roulette (Roulette): The roulette of the next stage.
+        guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
+        trial (RouletteTrial): The measured effect of the roulette of the last pilot; ``None`` where
+            none is learned.
+        sample_count (int): How many samples of directions the trees were built from.
+    """
+
+    def __init__(
+        self,
+        regions: Callable[[mi.Point3f, mi.Normal3f], Regions],
+        wants_scout: bool,
+        bounces: int,
+        max_memory: int,
+        pilot_samples: int,
+        film_size: tuple[int, int],
+        always: bool = False,
+    ) -> None:
+        self.make_regions, self.wants_scout = regions, wants_scout
+        self.bounces, self.max_memory, self.pilot_samples = bounces, max_memory, pilot_samples
+        self.always = always
+        self.guide: GuidedDirections | None = None
+        self.guidance: Guidance | None = None
+        self.roulette, self.trial = Roulette(), None
+        self._rr_depth: int | None = None
+        self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
+        self.pixel_count = film_size[0] * film_size[1]
+        #: The time of a sample, in units of that of ``path`` without guides
+        self._time = 1.0
+        self.sample_count = 0
+        self._records: PathRecords | None = None
+        self._share, self._summary = _FIRST_SHARE, ""
+        self._batches: list[np.ndarray] = []
+
+    def start(
+        self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f
+    ) -> GuidedDirections | None:
+        self._summary = "no guide: no path scatters"
+        if self.wants_scout and dr.width(p) == 0:
+            return None
+        self._regions = self.make_regions(p, n)
+        self._begin_records()
+        if not isinstance(self._regions, SurfaceRegions):
+            return None
+        # As ``path``, but with the kernel of the pilots that follow
+        count = self._regions.count + 1
+        if self._rr_depth is not None:
+            self.roulette = AdjointRoulette.by_throughput(
+                self._regions, count, self.pixel_count
+            )
+        return GuidedDirections(SampleTrees.uniform(count), self._regions, self.bounces)
+
+    def _begin_records(self) -> None:
+        bytes_per_path = self.bounces * BYTES_PER_RECORD
+        if self._rr_depth is not None:
+            bytes_per_path += BYTES_PER_PATH
+        stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
+        if self._rr_depth is not None:
+            self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
+        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
+
+    def learn_roulette(self, rr_depth: int) -> None:
+        """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
+        self._rr_depth = rr_depth
+
+    def beside_light_paths(self, time: float) -> GuideLearner:
+        """A learner of the same regions for camera paths that bring less light from now on, as
+        light paths bring the rest. Its first guide is that of this learner, but it learns from new
+        samples only. ``time`` is that of a sample, in units of that of ``path``."""
+        other = GuideLearner(
+            self.make_regions, self.wants_scout, self.bounces, self.max_memory,
+            self.pilot_samples, self._film_size, self.always,
+        )  # fmt: skip
+        other.guide, other._share, other._regions = self.guide, self._share, self._regions
+        other._summary, other._time = self._summary, time
+        other._begin_records()
+        return other
+
+    # ---- Observer ----
+
+    def kernel_state(self) -> list[Observer]:
+        """The attributes on which kernels depend (``frozen.py``)."""
+        return self._observers()
+
+    def begin(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.begin(*arguments)
+
+    def direction(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.direction(*arguments)
+
+    def survival(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.survival(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        for observer in self._observers():
+            observer.end(L)
+
+    def _observers(self) -> list[Observer]:
+        if self._records is None:
+            return []
+        return [observer for observer in (self._records, self.trial) if observer is not None]
+
+    # ---- Between the stages ----
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> DirectionSamples | None:
+        records = self._records
+        if records is None:
+            return None
+        records.finish()
+        if self.trial is not None:
+            self.trial.finish()
+        if records.count == 0:
+            self._records, self._summary = None, "no guide: no path scatters"
+            self.roulette = Roulette()
+            return DirectionSamples()
+        bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
+        self.sample_count = records.count
+        if self.guide is not None and records.count > records.first_new:
+            # A short trial shows whether guiding is hopeless, but not how many bounces to guide
+            is_trial = records.paths < _LEAST_SHARE * self.pilot_samples / records.stride
+            least = _TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY
+            gains = self.gains(records)
+            against_path = self._against_path(gains, least)
+            rays = _RAYS * (1 + (records.count - records.first_new) / max(records.paths, 1))
+            rays *= self._time
+            self.guidance = most_efficient(gains, self.always, *against_path, rays)
+            error = 0.0 if is_trial else self._error(records)
+            share, bounces, gain, efficiency = self.guidance
+            if is_trial:
+                bounces = self.bounces
+            effect = f"about {max(gain, 0):.0%} less variance"
+            if not (self.always or is_worth(efficiency, error, least)):
+                self.guide, self._records, self.roulette = None, None, Roulette()
+                self._summary = f"no guide: with {self._regions}, {effect}"
+                return DirectionSamples()
+        builder, roots, below = self._regions.build(records)
+        trees = SampleTrees(
+            builder.probability,
+            builder.child,
+            builder.is_even,
+            roots,
+            dr.full(mi.Float, share, len(roots)),
+            below,
+        )
+        records.restart_counting()
+        if self.trial is not None:
+            self.trial.restart()
+        self._share = share
+        self._summary = (
+            f"guide: {self._regions}, {records.count} samples, trees of "
+            f"{trees.bytes / 2**20:.1f} MiB for {bounces} bounces that decide {share:.0%} of the "
+            f"samples, {effect}"
+        )
+        self.guide = GuidedDirections(trees, self._regions, bounces)
+        if self._rr_depth is not None:
+            radiance = self._regions.incident_radiance(records)
+            self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
+        return self.guide
+
+    def state(self) -> dict[str, np.ndarray]:
+        if self.guide is None:
+            return {}
+        arrays = {**self.guide.trees.state(), **self.guide.regions.state()}
+        return {**arrays, "bounces": np.array(self.guide.bounces)}
+
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> GuidedDirections:
+        # Any vertex: these regions are replaced
+        regions = self.make_regions(mi.Point3f(0, 0, 0), mi.Normal3f(0, 0, 1))
+        regions.restore(state)
+        trees, bounces = SampleTrees.of_state(state), state.number("bounces", "iu", 1, 1 << 20)
+        state.require(
+            trees.count >= regions.tree_count, f"{trees.count} trees for {regions.tree_count} roots"
+        )
+        self.guide = GuidedDirections(trees, regions, bounces)
+        self._summary = f"guide: {regions}, for {bounces} bounces"
+        return self.guide
+
+    def finish(self) -> None:
+        self._records = None
+
+    def _against_path(
+        self, gains: Mapping[float, np.ndarray], least: float
+    ) -> tuple[float, float]:
+        """Variance and path length of uniform samples with the roulette of the next stage, relative
+        to those of ``path``. Returns to the roulette of ``path`` where the last pilot shows that
+        the learned one does not reach ``least`` times its efficiency."""
+        if self.trial is None:
+            return 1.0, 1.0
+        chosen, path = self.trial.drawn, self.trial.unguided
+        by_throughput = self.trial.by_throughput
+        if self._rr_depth is not None and not self.always:
+            if chosen.efficiency(by_throughput) < least:
+                self._rr_depth, self.roulette, chosen = None, Roulette(), by_throughput
+        if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
+            return 1.0, 1.0
+        guided = max(1 - gains[self._share].sum(), 1e-3)
+        return chosen.variance / path.variance / guided, chosen.segments / path.segments
+
+    def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
+        """The relative reduction of variance by the trees that drew the last samples, under the
+        same roulette: for each share of samples that they could decide, by bounce."""
+        new = dr.arange(mi.UInt32, records.count - records.first_new)
+        new += dr.opaque(mi.UInt32, records.first_new)
+        value, weight, importance, bounce = (
+            dr.gather(type(x), x, new)
+            for x in (records.value, records.weight, records.importance, records.bounce)
+        )
+        square, drawn = dr.square(value) * importance, dr.rcp(weight)
+        density = (drawn - (1 - self._share)) / self._share
+
+        place = bounce * BATCHES + dr.gather(mi.UInt32, records.batch, new)
+
+        def by_bounce(x: mi.Float) -> mi.Float64:
+            sums = dr.zeros(mi.Float64, records.bounces * BATCHES)
+            dr.scatter_add(sums, mi.Float64(x), place)
+            return sums
+
+        # The sums of squares with uniform samples, with those drawn, and with other shares
+        others = (square * drawn / dr.fma(share, density, 1 - share) for share in _SHARES)
+        found = [by_bounce(x) for x in (square * drawn, square, *others)]
+        # Evaluated together: each of them alone would be a kernel of its own
+        dr.eval(found)
+        self._batches = [x.numpy().reshape(-1, BATCHES) for x in found]
+        uniform, actual, *others = (x.sum(axis=1) for x in self._batches)
+        variance = max(records.variance + (uniform - actual).sum(), 1e-30)
+        gains = {share: (uniform - x) / variance for share, x in zip(_SHARES, others)}
+        # Where squares of large numbers overflow, no gain is shown
+        return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
+
+    def _error(self, records: PathRecords) -> float:
+        """The standard error of the logarithm of the variance that remains with the guidance."""
+        if not self._batches:
+            return 0.0
+        uniform, actual, *others = self._batches
+        other = others[_SHARES.index(self.guidance.share)][: self.guidance.bounces].sum(axis=0)
+        before = records.variances + (uniform - actual).sum(axis=0)
+        more = uniform[: self.guidance.bounces].sum(axis=0) - other
+        return gain_of(np.stack([before - more, more]))[1]
+
+    @property
+    def effect(self) -> Effect | None:
+        if self.guidance is None:
+            return None if self.guide is None else Effect(True)
+        variance = max(1 - self.guidance.gain, 1e-3)
+        time = 1 / (self.guidance.efficiency * variance)
+        about = {"share": self.guidance.share, "bounces": self.guidance.bounces}
+        return Effect(self.guide is not None, variance, time, about)
+
+    def __str__(self) -> str:
+        return self._summary
+
+
+def most_efficient(
+    gains: Mapping[float, np.ndarray],
+    all_bounces: bool = False,
+    variance: float = 1.0,
+    segments: float = 1.0,
+    rays: float = 8.0,
+) -> Guidance:
+    """The most efficient way to guide.
+
+    Parameters:
+        gains: The relative reductions of variance: for each share, by bounce.
+        all_bounces: Choose only among candidates that guide all bounces?
+        rays: The number of rays per path of ``path``.
+        variance, segments: Those of uniform samples under the same roulette, relative to ``path``.
+    """
+    candidates = []
+    for share, by_bounce in gains.items():
+        for index, left in enumerate(variance * (1 - np.cumsum(by_bounce))):
+            if all_bounces and index < len(by_bounce) - 1:
+                continue
+            cost = segments + (FIRST_GUIDED + GUIDED * index) / rays
+            efficiency = 1 / (max(left, 1e-3) * cost)
+            candidates.append(Guidance(share, index + 1, float(1 - left), efficiency))
+    return max(candidates, key=lambda guidance: (guidance.efficiency, guidance[:3]))

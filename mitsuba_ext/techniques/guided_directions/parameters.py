@@ -1,0 +1,69 @@
+"""The slot ``directions``: which primary samples choose the directions of a path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mitsuba as mi
+
+from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...planning.learner import Learner
+from ...rendering.camera import film_extent
+from .learner import GuideLearner
+from .surface_regions import SurfaceRegions
+from .tile_regions import MOST_BOUNCES, TileRegions
+
+#: The fewest pilot samples that a region of surfaces should have.
+_REGION_SAMPLES = 64
+
+
+class Guided(DecisionParameters):
+    """Guides directions in primary sample space. The attributes are the parameters of the plugin
+    ``guided_directions``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    name = "guided_directions"
+    slots = ("directions",)
+    pilot_spp, tries = 32, True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.regions = read("regions", "surfaces", choices=("surfaces", "tiles"))
+        if self.regions == "tiles":
+            self.tile = read("tile", 16, minimum=1)
+            self.bounces = read("bounces", 2, minimum=1, maximum=MOST_BOUNCES)
+        else:
+            self.bounces = read("bounces", 6, minimum=1, maximum=64)
+        self.always_guide = read("always_guide", False)
+        self.max_memory = read("max_memory", 512.0, minimum=1e-3)
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        # Trees are built from the first pilot and tested in the second; the third one is drawn from
+        # better trees, built from both
+        return spp >= 3 and bool(scene.emitters())
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        if not self.can_learn(setting.scene, setting.pilot_spp):
+            return None
+        samples = setting.pilot_samples
+        width, height = film_extent(setting.sensor.film())
+
+        def tiles(p: mi.Point3f, n: mi.Normal3f) -> TileRegions:
+            return TileRegions(width, height, self.tile)
+
+        def surfaces(p: mi.Point3f, n: mi.Normal3f) -> SurfaceRegions:
+            # The scout has one path in each pixel
+            return SurfaceRegions(p, n, max(1.0, _REGION_SAMPLES * width * height / samples))
+
+        by_tiles = self.regions == "tiles"
+        return GuideLearner(
+            tiles if by_tiles else surfaces,
+            not by_tiles,
+            min(self.bounces, setting.max_depth - 1),
+            int(self.max_memory * 2**20),
+            samples,
+            (width, height),
+            self.always_guide,
+        )

@@ -1,0 +1,27 @@
+"""The slot ``roulette``: which paths Russian roulette continues."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ...planning.decision_parameters import DecisionParameters, Setting
+from ...planning.learner import Learner
+from .guided_roulette import RouletteLearner
+from .learner import GuideLearner
+
+
+class GuidedRoulette(DecisionParameters):
+    """Russian roulette by the radiance that a path is expected to add to its pixel, where
+    directions are guided by regions of surfaces; elsewhere the roulette of Mitsuba's ``path``."""
+
+    name = "automatic"
+    slots = ("roulette",)
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        guide = others.get("directions")
+        # A guide by tiles of the film learns nothing about the position of a bounce
+        if not isinstance(guide, GuideLearner) or not guide.wants_scout:
+            return None
+        if setting.rr_depth >= setting.max_depth:
+            return None
+        return RouletteLearner(guide, setting.rr_depth)

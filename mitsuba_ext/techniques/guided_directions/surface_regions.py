@@ -1,0 +1,137 @@
+"""Trees for regions of surfaces: paths that scatter in the same region share a tree."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...scene.regions.nested_regions import NestedRegions
+from ...scene.regions.surface_sides import lit_normal
+from ...util.arrays import from_numpy
+from ...util.stored_arrays import StoredArrays
+from .path_records import PathRecords
+from .sample_trees import SampleTrees
+from .tree_builder import UNIFORM, Samples, TreeBuilder
+
+#: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
+_PRIOR = 32
+
+
+class SurfaceRegions:
+    """A tree for each of some regions of surfaces (:class:`NestedRegions`).
+
+    The last number stands for mirrors and glass, whose directions do not depend on the sample: its
+    tree has no splits. At each bounce, a path uses the tree of the region in which it scatters.
+
+    Parameters:
+        p, n: Vertices where paths scatter, and normals on the side that is lit; not empty.
+        least: The least number of these vertices in a region.
+
+    Attributes:
+        count: Number of regions that learn.
+    """
+
+    def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
+        self._set(NestedRegions(p, n, least))
+
+    def _set(self, regions: NestedRegions) -> None:
+        self._regions, self.count = regions, regions.count
+        self._specular = dr.opaque(mi.UInt32, self.count)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the walk needs of the regions, as arrays."""
+        return self._regions.state()
+
+    def restore(self, state: StoredArrays) -> None:
+        """Restores the regions from the arrays of :meth:`state`."""
+        self._set(NestedRegions.of_state(state))
+
+    @property
+    def tree_count(self) -> int:
+        """Number of trees: one more than there are regions, for mirrors and glass."""
+        return self.count + 1
+
+    # ---- During the walk ----
+
+    def begin(self, pixel: mi.UInt32 | None) -> tuple:
+        """There is no state."""
+        return ()
+
+    def tree(self, state: tuple, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """The tree of a vertex: that of the smallest region that contains it."""
+        return self.label(si, None, active)
+
+    def after(
+        self, state: tuple, trees: SampleTrees, leaf: mi.UInt32, active: mi.Bool
+    ) -> tuple:
+        """The state after a sample was drawn from a leaf."""
+        return state
+
+    # ---- What is learned ----
+
+    def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
+        """The region under which a sample is recorded."""
+        region = self._regions.number(si.p, lit_normal(si), active)
+        is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+        return dr.select(is_smooth, region, self._specular)
+
+    def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
+        """Builds the trees.
+
+        Returns:
+            The builder, the root of each region's tree, and ``None``: leaves do not lead to other
+            trees. The tree of the surrounding region is the prior of a region's tree.
+        """
+        levels = list(enumerate(self._regions.levels))
+        samples, of_level = Samples(records.code, records.value, records.weight), []
+        region = records.region
+        for level, _regions in reversed(levels):
+            # Coarser levels merge what finer ones have merged
+            around = dr.gather(mi.UInt32, mi.UInt32(self._around(level)), region)
+            samples = samples.in_order(around).merged()
+            region = samples.tree
+            of_level.insert(0, samples)
+        builder = TreeBuilder()
+        roots = np.full(self.count + 1, UNIFORM, np.uint32)
+        for (level, regions), samples in zip(levels, of_level):
+            size = regions.stop - regions.start
+            if size == 0:
+                continue
+            expected = mi.UInt32(roots[self._regions.parent[regions]]) if level > 0 else None
+            first = builder.add_sorted(samples, regions.start, size, expected)
+            roots[regions] = first + np.arange(size)
+        return builder, mi.UInt32(roots), None
+
+    def incident_radiance(self, records: PathRecords) -> mi.Float:
+        """The mean radiance that bounces find in each region; the surrounding region is the prior.
+        −1 for mirrors and glass. Shape [regions]."""
+        region = records.region.numpy()
+        # In double precision and a fixed order: equal seeds make equal sums
+        value, throughput, count = (
+            np.bincount(region, x, self.count + 1)
+            for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))
+        )
+        for regions in reversed(self._regions.levels[1:]):
+            for x in (value, throughput, count):
+                np.add.at(x, self._regions.parent[regions], x[regions])
+        radiance = np.full(self.count + 1, -1.0)
+        for level, regions in enumerate(self._regions.levels):
+            prior, expected = 0.0, 0.0
+            if level > 0:
+                prior = _PRIOR * throughput[regions] / np.maximum(count[regions], 1)
+                expected = radiance[self._regions.parent[regions]]
+            radiance[regions] = (value[regions] + prior * expected) / np.maximum(
+                throughput[regions] + prior, 1e-30
+            )
+        return from_numpy(mi.Float, np.minimum(radiance, 1e30))
+
+    def _around(self, level: int) -> np.ndarray:
+        """For each region, the region of a level in which it lies; itself if there is none."""
+        around = np.arange(self.count + 1, dtype=np.uint32)
+        for smaller in self._regions.levels[level + 1 :]:
+            around[smaller] = around[self._regions.parent[smaller]]
+        return around
+
+    def __str__(self) -> str:
+        return f"{self.count} regions of surfaces"

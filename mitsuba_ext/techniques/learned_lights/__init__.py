@@ -1,0 +1,1 @@
+"""Lights that are chosen by what pilots have found."""

@@ -1,0 +1,317 @@
+"""Learning which lights to choose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...planning.benefit import is_worth
+from ...planning.effect import Effect
+from ...planning.learner import Learner
+from ...planning.pixel_estimates import PixelEstimates
+from ...scene.lights.environment_bins import EnvironmentBins
+from ...scene.lights.light_cells import LightCells
+from ...scene.lights.weights import uniform_weights
+from ...scene.regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
+from ...scene.regions.surface_sides import region
+from ...transport.light_table import LightTable
+from ...transport.observer import Observer
+from ...transport.path_decisions import EmitterSampling
+from ...util.stored_arrays import StoredArrays
+from . import light_map_file
+from .connection_records import ConnectionRecords
+from .light_map import BYTES_PER_ENTRY, LightMap
+
+#: Share of the choices that do not follow the learned map: half of them use the unoccluded
+#: contributions, half the probabilities of ``path``, so that no probability is below 1/20 of that
+#: of ``path``. The map may miss a beam that lights a small part of a voxel.
+_DEFENSIVE = 0.1
+
+#: The most voxels along each axis with ``grid=0``; and the most entries of the map per sample of
+#: the pilots (with about three connections each).
+_GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
+
+#: The most entries of the first pilot's map, and of a finer one, per sample of the render: an entry
+#: takes a third of the time of a sample, all stages together. And the efficiency that the first
+#: pilot must predict for a finer map to follow.
+_TRIAL_ENTRIES, _MOST_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.0, 1.2
+
+#: So many entries may the first pilot's map have in any render: they take about 20 ms.
+_FEW_ENTRIES = 1 << 17
+
+#: The efficiency that a light table must reach; and that which it must reach with few samples for
+#: learning to continue: tables of more samples are little better.
+_LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
+
+#: The final decision is based on at least this share of all pilots' samples.
+_LEAST_SHARE = 0.2
+
+
+class LightMapLearner(Learner):
+    """Learns a light map in the pilots, and chooses lights with it.
+
+    Where the pilots show that choosing lights as ``path`` does is nearly as efficient, and nothing
+    else needs the map, learning ends there.
+
+    Parameters:
+        target: ``visibility`` or ``contribution``.
+        grid: Voxels along each axis of the region in which paths scatter; 0: chosen by the number
+            of pilot samples.
+        max_memory: Bytes that the map may take.
+        pilot_samples: Samples of all pilots together.
+        film_width: Pixels of a row of the film, with its border where that is sampled.
+        render_samples: Samples of the render, pilots included.
+        load, save: Files of a map to begin with, and of the map that was learned.
+        plugin: Name of the plugin in error messages.
+
+    Attributes:
+        map (LightMap): What has been learned so far; ``None`` if there is no map.
+        removed (float): The variance of a sample that the map has removed in the last pilot, in
+            units of the squared radiance of its pixel; ``None`` if it was not measured.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        grid: int,
+        max_memory: int,
+        pilot_samples: int,
+        film_width: int,
+        render_samples: float = math.inf,
+        load: Path | None = None,
+        save: Path | None = None,
+        plugin: str = "neepp",
+    ) -> None:
+        self.target, self.grid = target, grid
+        self.max_memory, self.pilot_samples = max_memory, pilot_samples
+        self.render_samples = render_samples
+        self.load, self.save, self.plugin = load, save, plugin
+        self._pixels = PixelEstimates(film_width)
+        # A loaded map contains its region and its rows
+        self.wants_scout = load is None
+        self._is_needed = grid > 0 or load is not None or save is not None
+        self.map: LightMap | None = None
+        self._records: ConnectionRecords | None = None
+        self._summary, self._effect = "", "not measured"
+        self._efficiency, self._measured = 1.0, (None, None)
+        self.removed: float | None = None
+        self._about: dict[str, float] = {}
+        self._is_kept: bool | None = None
+        self._is_tested = False
+        # Makes a finer map than that of the first pilot, with the same bins of the environment
+        self._finer_map: Callable[[], LightMap] | None = None
+        self._bins: EnvironmentBins | None = None
+
+    def keep_map(self) -> None:
+        """Keeps the map even where it does not pay for the choice of lights."""
+        self._is_needed, self._records = True, None
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
+        self.map, self._records, self._bins = None, None, None
+        self._summary = "lights: no path scatters"
+        if self.load is not None:
+            self.map = light_map_file.load(
+                self.load, scene, self.pilot_samples, self.max_memory,
+                parameter=f'"{self.plugin}": the parameter "load_map"',
+            )  # fmt: skip
+        elif dr.width(p) > 0:
+            self.map = self._first_map(scene, p, n)
+            # Mitsuba samples these with a wrong density
+            self._is_needed |= self.map.cells.has_smooth_meshes
+            if self.map.cells.count == 1 and not self._is_needed:
+                self.map, self._summary = None, "lights: there is only one"
+        if self.map is None:
+            return None
+        self._scene = scene
+        return self._begin_map()
+
+    def _begin_map(self) -> LightTable:
+        """The decision of the first pilot that fills a map."""
+        self._set_as_path(self._scene)
+        self._is_tested = False
+        if not self._is_needed:
+            self._records = ConnectionRecords(
+                self._scene, self._pixels, self.map.rows.count, self._as_path
+            )
+        return self._selection(self._probabilities(self.map.unoccluded))
+
+    def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
+        """The map of the first pilot."""
+        limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
+        trial = max(_FEW_ENTRIES, self.render_samples * _TRIAL_ENTRIES)
+        trial = math.inf if self._is_needed else trial
+        light_map = self._new_map(scene, p, n, min(limit, trial))
+        limit = min(limit, max(_FEW_ENTRIES, self.render_samples * _MOST_ENTRIES))
+        if trial < limit and light_map.rows.resolution < _GRID:
+            self._finer_map = lambda: self._new_map(scene, p, n, limit)
+        return light_map
+
+    def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f, limit: float) -> LightMap:
+        """The finest map of at most ``limit`` entries."""
+        bbox = region(p)
+        grid = self.grid or _GRID
+        cells = LightCells(scene, voxel_edges(bbox, grid), self._bins)
+        self._bins = cells.bins
+        counts = RowCounts(bbox, p, n)
+
+        def fits(grid: int) -> bool:
+            # A coarser grid has no more cells
+            entries = counts(grid) * cells.count
+            memory = entries * BYTES_PER_ENTRY + grid**3 * BYTES_PER_VOXEL
+            return entries <= limit and memory <= self.max_memory
+
+        while grid > 1 and not fits(grid):
+            grid = max(1, int(0.8 * grid))
+        rows = SurfaceRows(bbox, grid, p, n)
+        if grid != (self.grid or _GRID):
+            cells = LightCells(scene, voxel_edges(bbox, grid), cells.bins)
+        if self.grid > grid:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The light map of grid={self.grid} would exceed max_memory="
+                f"{self.max_memory / 2**20:g} MiB: grid={grid} is used.",
+            )
+        return LightMap(scene, rows, cells, self.pilot_samples)
+
+    # ---- Observer ----
+
+    def kernel_state(self) -> list[Observer]:
+        """The attributes on which kernels depend (``frozen.py``)."""
+        return self._observers()
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        for observer in self._observers():
+            observer.begin(lanes, pixel)
+
+    def vertex(self, *arguments) -> None:
+        if self._records is not None:
+            self._records.vertex(*arguments)
+
+    def emission(self, *arguments) -> None:
+        if self._records is not None:
+            self._records.emission(*arguments)
+
+    def connection(self, *arguments) -> None:
+        for observer in self._observers():
+            observer.connection(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        if self._records is not None:
+            self._records.end(L)
+
+    def _observers(self) -> list[Observer]:
+        return [observer for observer in (self.map, self._records) if observer is not None]
+
+    # ---- Between the stages ----
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> EmitterSampling | None:
+        if self.map is None:
+            return None
+        self.map.evaluate()
+        probabilities = self._probabilities(self.map.weights(self.target))
+        if self._records is not None and not self._pays(probabilities, is_last):
+            self.map = self._records = self._finer_map = None
+            self._is_kept = False
+            return EmitterSampling()
+        # The records are kept in trials: most pilot samples come later
+        if self._finer_map is not None and self._records is not None and not is_last:
+            if self._efficiency >= _FINER_EFFICIENCY:
+                self.map, self._finer_map = self._finer_map(), None
+                return self._begin_map()
+        if is_last:
+            self._is_kept, self._summary = True, f"{self.map}, {self._effect}"
+            if self.save is not None:
+                light_map_file.save(self.save, scene, self.map)
+        return self._selection(probabilities)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {} if self.map is None else light_map_file.arrays_of(self._scene, self.map)
+
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> LightTable:
+        self.map = light_map_file.of_arrays(state, scene, self.max_memory)
+        self._set_as_path(scene)
+        self.map.evaluate()
+        self._is_kept, self._summary = True, str(self.map)
+        return self._selection(self._probabilities(self.map.weights(self.target)))
+
+    def finish(self) -> None:
+        self.map = self._scene = self._finer_map = self._bins = None
+
+    def _set_as_path(self, scene: mi.Scene) -> None:
+        cells = self.map.cells
+        self._as_path = _normalized(uniform_weights(scene, cells), cells.count)
+
+    def _pays(self, probabilities: mi.Float, is_last: bool) -> bool:
+        """Does the map pay by the samples of the last pilot, or may it pay with more samples?"""
+        records = self._records
+        records.finish()
+        error = 0.0
+        is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
+        if self._is_tested:
+            # The samples were drawn from the table, and it was not learned from them
+            (gain, error), cost = records.measured, records.cost
+            self.removed = records.removed
+        else:
+            # The prediction is too optimistic, as the table was learned from the same samples, but
+            # too pessimistic where each entry has few of them. The pilot itself chose by unoccluded
+            # contributions, and a learned table is rarely worse than that
+            as_path = dr.tile(self._as_path, self.map.rows.count)
+            predicted = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
+            gain = max(predicted, records.measured[0])
+            is_trial, cost = not is_last, records.least_cost
+        efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+        if not self._about:
+            self._measured = 1 - gain, cost
+        left, time = self._measured
+        self._effect = f"about {max(0.0, 1 - left):.0%} less variance in {time:.2f} x the time"
+        # A trial need not be certain
+        least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
+        if not is_worth(efficiency, error, least):
+            would = f"a map would give {self._effect}"
+            self._summary = f"lights as path chooses them: {would} ({self.map})"
+            return False
+        self._is_tested = True
+        # Later pilots go on recording: without that, they would have other kernels
+        records.restart()
+        if not is_trial:
+            self._finer_map = None
+        return True
+
+    def _probabilities(self, weights: mi.Float) -> mi.Float:
+        """The probabilities of cells, with a defensive share: errors of the map exclude no cell."""
+        count, unoccluded = self.map.cells.count, self.map.unoccluded
+        as_path = dr.tile(self._as_path, self.map.rows.count)
+        safe = 0.5 * (_normalized(unoccluded, count) + as_path)
+        mixed = (1 - _DEFENSIVE) * _normalized(weights, count) + _DEFENSIVE * safe
+        # Cells with a sampling_weight of 0 have no weight in any row
+        return _normalized(dr.select(unoccluded > 0, mixed, 0), count)
+
+    def _selection(self, probabilities: mi.Float) -> LightTable:
+        return LightTable(self.map.rows, self.map.cells, probabilities)
+
+    def set_variance(self, variance: float, trimmed: float) -> None:
+        """Sets the variance of a sample of ``path`` with the map, in the units of :attr:`removed`,
+        for :attr:`effect`: pilots of ``path`` hold few of the rare paths that make most of it.
+        ``trimmed`` is that without the brightest contributions."""
+        left, trimmed = (x / max(x + self.removed, 1e-30) for x in (variance, trimmed))
+        self._measured, self._about = (left, self._measured[1]), {"trimmed_variance": trimmed}
+
+    @property
+    def effect(self) -> Effect | None:
+        if self._is_kept is None:
+            return None
+        return Effect(self._is_kept, *self._measured, self._about)
+
+    def __str__(self) -> str:
+        return self._summary
+
+
+def _normalized(weights: mi.Float, count: int) -> mi.Float:
+    """Weights that add up to one in each row; a row of zeros has equal ones."""
+    total = dr.repeat(dr.block_sum(weights, count), count)
+    return dr.select(total > 0, weights / total, dr.rcp(mi.Float(count)))

@@ -1,0 +1,1 @@
+"""Lights that are chosen by an estimate of what each contributes to the vertex."""

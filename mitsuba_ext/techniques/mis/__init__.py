@@ -1,0 +1,1 @@
+"""Heuristics of multiple importance sampling."""

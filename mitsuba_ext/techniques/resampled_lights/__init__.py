@@ -1,0 +1,1 @@
+"""Lights that are resampled from a few candidates."""

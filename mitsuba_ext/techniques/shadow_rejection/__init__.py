@@ -1,0 +1,1 @@
+"""Russian roulette on shadow rays by learned visibility."""

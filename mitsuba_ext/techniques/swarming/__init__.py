@@ -1,0 +1,1 @@
+"""Sample swarming: maps of primary samples for each tile of the film."""

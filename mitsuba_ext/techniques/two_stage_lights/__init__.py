@@ -1,0 +1,1 @@
+"""Directions of an environment by the product of BSDF, light and learned visibility."""

@@ -1,0 +1,251 @@
+"""How often directions of an environment are visible, by tile of the film.
+
+Source: Cline, PhD dissertation, chapter 6. Instead of maps at the corners of a grid, of which the
+four around a pixel must agree, samples are counted in tiles, and the tiles around each one are a
+prior. Instead of three classes (visible, occluded, uncertain), there are probabilities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...transport.observer import Observer
+from ...util.arrays import from_numpy
+from ...util.discrete_sampling import ONE_MINUS_EPSILON
+from ...util.stored_arrays import StoredArrays
+
+#: The least edge of a tile in pixels, and the most tiles of a film.
+_TILE, _MOST_TILES = 8, 8192
+
+#: The weight, in tests, of the priors: a cell's counts in the tile and those around it, whose prior
+#: is the sum over all cells of these tiles.
+_PRIOR_TESTS = 1.0
+
+
+@dataclass
+class Tile:
+    """The maps for a vertex.
+
+    Attributes:
+        number: Number of the tile.
+        is_known: Do the maps apply to this vertex? Later vertices of a path lie elsewhere.
+    """
+
+    number: mi.UInt32
+    is_known: mi.Bool
+
+
+@dataclass
+class Cell:
+    """Where a connection lies in the maps.
+
+    Attributes:
+        index: The number of the cell, that of its tile included.
+        is_known: Does the connection belong to a cell?
+    """
+
+    index: mi.UInt32
+    is_known: mi.Bool
+
+
+class VisibilityCounts(Observer):
+    """Counts the shadow rays of each cell of each tile, and how many were unoccluded.
+
+    Parameters:
+        width, height: Size of the film in pixels, with its border where that is sampled.
+        columns, rows: Number of columns and rows of the cells of a tile.
+    """
+
+    def __init__(self, width: int, height: int, columns: int, rows: int) -> None:
+        self.edge = _TILE
+        while -(-width // self.edge) * -(-height // self.edge) > _MOST_TILES:
+            self.edge += 1
+        self.across, self.down = -(-width // self.edge), -(-height // self.edge)
+        self.columns, self.rows = columns, rows
+        self._width, self._across, self._edge = (
+            dr.opaque(mi.UInt32, n) for n in (width, self.across, self.edge)
+        )
+        # Tests in the low half, successes in the high one: one addition counts both
+        self._counts = dr.zeros(mi.UInt64, self.across * self.down * columns * rows)
+
+    def tile(self, pixel: mi.UInt32) -> mi.UInt32:
+        """The number of a pixel's tile."""
+        y = pixel // self._width
+        return y // self._edge * self._across + (pixel - y * self._width) // self._edge
+
+    def cell(self, tile: mi.UInt32, point: mi.Point2f) -> mi.UInt32:
+        """The cell of a point of the unit square."""
+        x, y = (
+            mi.UInt32(dr.clip(value, 0, ONE_MINUS_EPSILON) * count)
+            for value, count in ((point.x, self.columns), (point.y, self.rows))
+        )
+        return (tile * self.rows + y) * self.columns + x
+
+    def connection(
+        self, choice: Cell, vertex, ds, contribution, value, pdf, visible, tested
+    ) -> None:
+        dr.scatter_add(
+            self._counts, dr.select(visible, mi.UInt64((1 << 32) + 1), 1), choice.index,
+            tested & choice.is_known,
+        )  # fmt: skip
+
+    @property
+    def counts(self) -> np.ndarray:
+        return self._counts.numpy()
+
+    def restore(self, state: StoredArrays) -> None:
+        """Sets the counts to the array ``counts``, made for a film of the same size.
+
+        Raises:
+            DamagedError: They are no such counts.
+        """
+        counts = state.take("counts", "u", (len(self._counts),)).astype(np.uint64)
+        is_sound = (counts >> 32) <= (counts & 0xFFFFFFFF)
+        state.require(bool(is_sound.all()), 'there are more successes than tests in "counts"')
+        self._counts = from_numpy(mi.UInt64, counts)
+
+    def release(self) -> None:
+        """Frees the counts."""
+        self._counts = mi.UInt64()
+
+    def visibility(self) -> np.ndarray:
+        """The probability that a shadow ray arrives, never 0; shape [tiles, rows, columns]."""
+        counts = self.counts.reshape(self.down, self.across, self.rows, self.columns)
+        tests, seen = (counts & 0xFFFFFFFF).astype(np.float64), (counts >> 32).astype(np.float64)
+        near_tests, near_seen = _with_neighbours(tests), _with_neighbours(seen)
+        # Half a success in one more test keeps the prior from being 0
+        all_tests, all_seen = (
+            x.sum(axis=(2, 3), keepdims=True) for x in (near_tests, near_seen)
+        )
+        prior = (all_seen + 0.5) / (all_tests + 1)
+        prior = (near_seen + _PRIOR_TESTS * prior) / (near_tests + _PRIOR_TESTS)
+        result = (seen + _PRIOR_TESTS * prior) / (tests + _PRIOR_TESTS)
+        return result.reshape(-1, self.rows, self.columns)
+
+    def __str__(self) -> str:
+        tests, seen = (int(n.sum()) for n in (self.counts & 0xFFFFFFFF, self.counts >> 32))
+        return (
+            f"visibility: {self.across} x {self.down} tiles of {self.edge} pixels, {self.columns} "
+            f"x {self.rows} cells, {seen / max(tests, 1):.1%} of {tests} shadow rays arrived"
+        )
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """The sum over each tile and the eight around it."""
+    padded = np.pad(values, ((1, 1), (1, 1), (0, 0), (0, 0)))
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+
+
+class PrimaryVisibility:
+    """Warps the random numbers of connections: cells of the unit square get more of them, the more
+    often their connections were unoccluded.
+
+    Parameters:
+        counts: The counts of these cells.
+        reallocated: The share of the numbers that is distributed so; the rest stays uniform.
+    """
+
+    def __init__(self, counts: VisibilityCounts, reallocated: float) -> None:
+        # The variance is least where the density is the root of the mean square
+        weight = np.sqrt(counts.visibility())
+        size = counts.rows * counts.columns
+        weight *= size / weight.sum(axis=(1, 2), keepdims=True)
+        weight = (1 - reallocated) + reallocated * weight
+        rows = weight.sum(axis=2)
+        self._density = from_numpy(mi.Float, weight)
+        self._of_rows = _cumulative(rows)
+        self._of_columns = _cumulative(weight)
+        self._counts = counts
+
+    def sample(
+        self, tile: Tile, point: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Point2f, mi.Float]:
+        """Warps uniform numbers; returns the numbers and their density."""
+        counts, active, uniform = self._counts, active & tile.is_known, point
+        first = tile.number * counts.rows
+        row, y = _search(self._of_rows, first, counts.rows, point.y, active)
+        first = (first + row) * counts.columns
+        column, x = _search(self._of_columns, first, counts.columns, point.x, active)
+        density = dr.gather(mi.Float, self._density, first + column, active)
+        point = mi.Point2f((column + x) / counts.columns, (row + y) / counts.rows)
+        return dr.select(active, point, uniform), dr.select(active, density, 1)
+
+    def density(self, tile: Tile, point: mi.Point2f, active: mi.Bool) -> mi.Float:
+        """The density of numbers."""
+        active = active & tile.is_known
+        cell = self._counts.cell(tile.number, point)
+        return dr.select(active, dr.gather(mi.Float, self._density, cell, active), 1)
+
+
+def _cumulative(weight: np.ndarray) -> mi.Float:
+    """Sums along the last axis up to and including each entry, scaled so that the last is 1."""
+    sums = np.cumsum(weight, axis=-1)
+    return from_numpy(mi.Float, sums / sums[..., -1:])
+
+
+def _search(table: mi.Float, first: mi.UInt32, count: int, number: mi.Float, active):
+    """The entry that a number chooses, and the rest of the number, stretched to [0, 1)."""
+    index = mi.UInt32(0)
+    step = 1 << (count - 1).bit_length() - 1
+    while step > 0:
+        below = dr.gather(mi.Float, table, first + index + (step - 1), active)
+        index += dr.select(number >= below, mi.UInt32(step), 0)
+        step >>= 1
+    low = dr.gather(mi.Float, table, first + index - 1, active & (index > 0))
+    high = dr.gather(mi.Float, table, first + index, active)
+    left = (number - low) / dr.maximum(high - low, 1e-12)
+    return index, dr.clip(left, 0, ONE_MINUS_EPSILON)
+
+
+class WorldVisibility:
+    """Weights of rectangles of an environment by their visibility.
+
+    Parameters:
+        counts: The counts of cells, which have equal size in the environment map.
+        reallocated: The share of the samples that follow visibility; the rest ignores it.
+        emission: The share of each cell in the total emission; shape [rows, columns].
+        columns, rows: Number of columns and rows of the texels of the environment map.
+    """
+
+    def __init__(
+        self, counts: VisibilityCounts, reallocated: float, emission: np.ndarray, columns: int,
+        rows: int,
+    ) -> None:  # fmt: skip
+        weight = np.sqrt(counts.visibility())
+        mean = (weight * emission).sum(axis=(1, 2), keepdims=True)
+        weight = (1 - reallocated) * mean + reallocated * weight
+        # Summed-area tables of the weights and of their squares
+        sums = np.zeros((len(weight), counts.rows + 1, counts.columns + 1, 2))
+        values = np.stack([weight, weight**2], axis=-1)
+        sums[:, 1:, 1:] = values.cumsum(axis=1).cumsum(axis=2)
+        self._sums = from_numpy(mi.Float, sums)
+        # Opaque: it differs from render to render, and the kernel must not
+        self._least = dr.opaque(mi.Float, float(weight.min()))
+        self._counts = counts
+        self._x, self._y = counts.columns / columns, counts.rows / rows
+
+    def seen(
+        self, tile: Tile, x0: mi.UInt32, y0: mi.UInt32, x1: mi.UInt32, y1: mi.UInt32,
+        active: mi.Bool,
+    ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+        """The mean weight of the cells that a rectangle of texels touches, positive, and the
+        standard deviation between them; a constant where the tile is not known."""
+        counts, active = self._counts, active & tile.is_known
+        a, c = mi.UInt32(mi.Float(x0) * self._x), mi.UInt32(mi.Float(y0) * self._y)
+        b = dr.maximum(mi.UInt32(dr.ceil(mi.Float(x1) * self._x)), a + 1)
+        d = dr.maximum(mi.UInt32(dr.ceil(mi.Float(y1) * self._y)), c + 1)
+        b, d = dr.minimum(b, counts.columns), dr.minimum(d, counts.rows)
+        stride = counts.columns + 1
+        first = tile.number * (stride * (counts.rows + 1))
+        s = [
+            dr.gather(mi.Point2f, self._sums, first + y * stride + x, active)
+            for x, y in ((a, c), (b, c), (a, d), (b, d))
+        ]
+        both = ((s[3] - s[2]) - (s[1] - s[0])) / mi.Float((b - a) * (d - c))
+        mean = dr.maximum(both.x, self._least)
+        return mean, dr.sqrt(dr.maximum(both.y - dr.square(mean), 0))

@@ -1,0 +1,1 @@
+"""Weighted point sets for connections, and for the numbers of camera rays."""

@@ -1,0 +1,48 @@
+"""The slot ``connections``: to how many points on lights a vertex is connected."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...util.pointsets import PATTERNS
+from .weighted_connections import NoFirstConnections, WeightedConnections
+from .weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
+
+#: The most connections of a vertex.
+_MOST = 4096
+
+#: Number of connections that take about as long as a path.
+_PER_PATH = 16
+
+
+class Connections(DecisionParameters):
+    """The number of connections of a vertex, and the point sets that choose them. The attributes
+    are the parameters of the plugin ``weighted_connections``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    name = "weighted_connections"
+    slots = ("connections",)
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.pattern = read("pattern", "hammersley", choices=PATTERNS)
+        self.weights = read("weights", "none", choices=WEIGHTS)
+        most = MOST_SLOW_POINTS if self.pattern == SLOW_PATTERN else _MOST
+        self.count = read("count", 16, minimum=0, maximum=most)
+        self.vertices = read("vertices", "first", choices=("first", "all"))
+
+    @property
+    def sample_cost(self) -> int:
+        return max(1, self.count // _PER_PATH)
+
+    def decision(self, setting: Setting) -> Any | None:
+        if not setting.scene.emitters() or setting.max_depth < 2:
+            return None
+        everywhere = self.vertices == "all"
+        if self.count == 0:
+            return NoFirstConnections(everywhere)
+        sets = WeightedSets(self.pattern, self.weights, self.count, 2, setting.seed)
+        return WeightedConnections(sets, everywhere)

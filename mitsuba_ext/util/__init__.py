@@ -1,0 +1,1 @@
+"""What knows nothing of scenes: arrays, files, errors, parameters, point sets, and sequences."""
