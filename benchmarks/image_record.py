@@ -58,6 +58,7 @@ def record(scene_name: str, specification: str, seed: int) -> dict[str, Any]:
     from mitsuba_ext.inputs.specifications import make_named
 
     width, height = SIZE
+    dr.set_thread_count(2)  # with one thread, Mitsuba waits for ever when it reads an EXR file
     scene = mi.load_file(
         str(SCENES / f"{scene_name}.xml"), width=width, height=height, optimize=False
     )

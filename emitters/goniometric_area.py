@@ -7,7 +7,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.scene.luminaires.area_luminaire import AreaLuminaire
+from mitsuba_ext.bases.area_luminaire import AreaLuminaire
 from mitsuba_ext.scene.luminaires.ies import read_ies
 from mitsuba_ext.scene.luminaires.profiles import AngularTable, PowerOfCosine
 from mitsuba_ext.startup import registry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.scene.luminaires.moving_emitter import MovingEmitter
+from mitsuba_ext.bases.moving_emitter import MovingEmitter
 from mitsuba_ext.scene.motion.motion_parameters import read_motion
 from mitsuba_ext.scene.movers import is_moving_light
 from mitsuba_ext.scene.nesting import class_name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.scene.luminaires.area_luminaire import AreaLuminaire
+from mitsuba_ext.bases.area_luminaire import AreaLuminaire
 from mitsuba_ext.startup import registry
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from mitsuba_ext.bases.slots import METHODS
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.next_event import METHODS, LearnedLights
+from mitsuba_ext.techniques.learned_lights.parameters import LearnedLights
 from mitsuba_ext.techniques.shadow_rejection.parameters import RejectedShadowRays
 
 _LEARNING = "lights that are chosen by what was learned (visibility or contribution)"

@@ -16,8 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 from .startup import mitsuba_import
-
-__version__ = "0.2.0"
+from .util.version import __version__
 
 __all__ = ["__version__"]
 

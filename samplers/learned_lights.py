@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.next_event import LearnedLights
+from mitsuba_ext.techniques.learned_lights.parameters import LearnedLights
 
 
 @registry.plugin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.next_event import PortalLights
+from mitsuba_ext.techniques.portal_lights.parameters import PortalLights
 
 
 @registry.plugin

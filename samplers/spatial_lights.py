@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.next_event import SpatialLights
+from mitsuba_ext.techniques.spatial_lights.parameters import SpatialLights
 
 
 @registry.plugin

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_ext.bases.moving_emitter import MovingEmitter
 from mitsuba_ext.scene.bounds import shape_bounds
-from mitsuba_ext.scene.luminaires.moving_emitter import MovingEmitter
 from mitsuba_ext.scene.motion.motion_parameters import read_motion
 from mitsuba_ext.scene.motion.rigid_motion import Motion
 from mitsuba_ext.scene.placeholder import span

@@ -1,5 +1,5 @@
-"""Imports point one way: plugins → bases → techniques, estimators → planning → rendering → transport →
-scene → util; ``pointsets`` needs nobody's scene, and no two rooms import each other."""
+"""Imports point one way: plugins → bases → techniques, estimators → planning → rendering →
+transport → scene → util; ``pointsets`` needs nobody's scene, and no two rooms import each other."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ from mitsuba_ext.planning.decision_parameters import Setting
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
 from mitsuba_ext.scene.regions.surface_rows import SurfaceRows
-from mitsuba_ext.techniques.next_event import sampling_weights
-from mitsuba_ext.transport.light_table import LightTable
+from mitsuba_ext.transport.light_table import LightTable, sampling_weights
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
 
 pytestmark = pytest.mark.usefixtures("variant")

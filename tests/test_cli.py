@@ -253,14 +253,14 @@ def test_every_integrator_of_mitsuba_is_known_by_name(variant):
 
 
 def test_list_shows_every_plugin(run):
-    from mitsuba_ext.startup import registry
+    from mitsuba_ext.startup import plugin_folders
 
     code, out, _ = run("list")
     assert code == 0
     assert re.search(r"neepp +│ integrator +│", out)
     assert re.search(r"guided_directions +│ decision +│", out)
     assert re.search(r"sobol_owen +│ sampler +│", out)
-    for names in registry.plugin_names().values():
+    for names in plugin_folders.plugin_names().values():
         for name in names:
             assert name in out
             code, page, _ = run("list", name)

@@ -347,12 +347,13 @@ def test_render_interrupted_before_its_first_pass_leaves_an_older_file_alone(
 def third_pass_gets(request, monkeypatch):
     """What makes every third pass of 4 samples get signals, 10 ms from each other; returns the
     integrator."""
-    job, lengths = {
-        "path": (seed_passes.SeedPasses, seed_passes), "composed_path": (rendering.Job, plan),
+    job, name, lengths = {
+        "path": (seed_passes.SeedPasses, "_run_pass", seed_passes),
+        "composed_path": (rendering.Job, "run_pass", plan),
     }[request.param]  # fmt: skip
     monkeypatch.setattr(lengths, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
     monkeypatch.setattr(lengths, "_PASS_SPP", 1)
-    run_pass, passes = job._run_pass, []
+    run_pass, passes = getattr(job, name), []
 
     def set_signals(*names: str) -> str:
         def interrupted(self, *arguments):
@@ -362,7 +363,7 @@ def third_pass_gets(request, monkeypatch):
                 time.sleep(0.01)
             return run_pass(self, *arguments)
 
-        monkeypatch.setattr(job, "_run_pass", interrupted)
+        monkeypatch.setattr(job, name, interrupted)
         return request.param
 
     return set_signals

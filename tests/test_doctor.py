@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 import mitsuba_ext
-from mitsuba_ext.startup import doctor, registry
+from mitsuba_ext.startup import doctor, plugin_folders
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_integrators_that_wrap_others_are_tried_around_one_of_ours():
-    for name in registry.plugin_names()["integrators"]:
+    for name in plugin_folders.plugin_names()["integrators"]:
         if name == "reweighted_wavelength":
             with pytest.raises(RuntimeError, match="use a spectral one"):
                 doctor._make(name)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import pytest
 
 from mitsuba_ext.cli.export_blender import blender_table
-from mitsuba_ext.startup import pages, registry
+from mitsuba_ext.startup import pages, plugin_folders
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -55,9 +55,9 @@ def _values(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_every_integrator_that_nests_none_is_in_the_table() -> None:
-    left_out = {path.stem for path in registry.plugin_files("integrators")} - set(TABLE)
+    left_out = {path.stem for path in plugin_folders.plugin_files("integrators")} - set(TABLE)
     nesting = {
-        path.stem for path in registry.plugin_files("integrators")
+        path.stem for path in plugin_folders.plugin_files("integrators")
         if any(row.type == "integrator" for row in pages.read_page(path).parameters)
     }
     assert left_out == nesting | {"composed_prb"}

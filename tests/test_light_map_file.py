@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from maps import floor, lamp, map_of
 
+from mitsuba_ext.scene.fingerprint import digest, fingerprint
 from mitsuba_ext.scene.lights.division import emitter_shapes
 from mitsuba_ext.techniques.learned_lights import light_map_file
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
@@ -49,7 +50,7 @@ def _counts(scene: mi.Scene, light_map) -> dict[bytes, np.ndarray]:
     tests = light_map.tests.numpy().reshape(-1, cells.count)
     counts: dict[bytes, list] = {}
     for index, (emitter, shape) in enumerate(zip(scene.emitters(), emitter_shapes(scene))):
-        key = light_map_file._of(shape or emitter)
+        key = digest(shape or emitter)
         counts.setdefault(key, []).append(tests[:, cells.emitter_index == index])
     return {key: np.sort(np.concatenate(parts, axis=1)) for key, parts in counts.items()}
 
@@ -161,7 +162,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path):
 
 def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
     def of(**more) -> str:
-        return light_map_file.fingerprint(floor(**more))
+        return fingerprint(floor(**more))
 
     base = of(a=lamp(0, 0, 1))
     assert base == of(a=lamp(0, 0, 1)) == of(a=lamp(0, 0, 1), s={"type": "perspective"})

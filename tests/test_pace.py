@@ -35,7 +35,7 @@ class _Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, compiling: float = 0.0) -> None:
         self.now, self.compiling = 0.0, compiling
-        run_pass = rendering.Job._run_pass
+        run_pass = rendering.Job.run_pass
 
         def run_on_clock(job, stage, spp):
             run_pass(job, stage, spp)
@@ -44,7 +44,7 @@ class _Clock:
             self.now += 0.1 * spp + (self.compiling if is_new else 0.0)
             return is_new
 
-        monkeypatch.setattr(rendering.Job, "_run_pass", run_on_clock)
+        monkeypatch.setattr(rendering.Job, "run_pass", run_on_clock)
         monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
         monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
 

@@ -48,7 +48,8 @@ def test_version_is_that_of_the_changes_and_of_the_citation() -> None:
     date = re.findall(r'^date-released: "(.+)"$', citation, re.MULTILINE)
     assert entries[0] == (mitsuba_ext.__version__, *date)
     assert version == [mitsuba_ext.__version__]
-    assert re.search(r'^version = \{ attr = "mitsuba_ext.__version__" \}$', PYPROJECT, re.MULTILINE)
+    attribute = r'^version = \{ attr = "mitsuba_ext.util.version.__version__" \}$'
+    assert re.search(attribute, PYPROJECT, re.MULTILINE)
 
 
 def test_authors_and_keywords_are_those_of_the_citation() -> None:
@@ -167,8 +168,8 @@ def test_source_tree_that_is_not_installed_finds_its_plugins(source_tree: Path) 
     code = """
 import mitsuba_ext
 from mitsuba_ext import cli
-from mitsuba_ext.startup import registry
-print(*registry.plugin_files("integrators"))
+from mitsuba_ext.startup import plugin_folders
+print(*plugin_folders.plugin_files("integrators"))
 cli.main(["list"])
 """
     output = _run(source_tree, "-c", code).stdout
@@ -258,12 +259,12 @@ def test_archive_and_wheel_work_in_another_environment(
     code = """
 import inspect, pathlib, sys
 import mitsuba_ext
-from mitsuba_ext.startup import doctor, registry
+from mitsuba_ext.startup import doctor, plugin_folders
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 assert pathlib.Path(inspect.getfile(mitsuba_ext)).is_relative_to(sys.prefix)
 assert "mitsuba_ext" in inspect.getsource(registry)
-assert any(registry.plugin_names().values())
+assert any(plugin_folders.plugin_names().values())
 sys.exit(doctor.main())
 """
     scene = tmp_path / "scene.xml"

@@ -10,17 +10,17 @@ import pytest
 
 from mitsuba_ext.bases.slots import SLOTS
 from mitsuba_ext.inputs.specifications import make_named
-from mitsuba_ext.startup import pages, registry
+from mitsuba_ext.startup import pages, plugin_folders
 
 import mitsuba as mi  # isort: skip
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-FOLDERS = registry.plugin_names()
-FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
+FOLDERS = plugin_folders.plugin_names()
+FILES = {file.stem: file for folder in FOLDERS for file in plugin_folders.plugin_files(folder)}
 README = Path(__file__).parents[1] / "README.md"
 CHOICES = Path(__file__).parents[1] / "docs" / "choose.md"
-DECISIONS = registry.decision_names()
+DECISIONS = plugin_folders.decision_names()
 #: The samplers of sensors.
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.

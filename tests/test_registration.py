@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext.startup import registry, runtime
+from mitsuba_ext.startup import plugin_folders, runtime
 
 LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith("llvm")]
 
@@ -21,8 +22,8 @@ WRAPPERS = (
 )
 
 def load_all():
-    from mitsuba_ext.startup import registry
-    for name in registry.plugin_names()["integrators"]:
+    from mitsuba_ext.startup import plugin_folders, registry
+    for name in plugin_folders.plugin_names()["integrators"]:
         if name == "reweighted_wavelength" and not mi.is_spectral:
             continue
         if name in WRAPPERS:
@@ -63,14 +64,25 @@ for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
 """)
 
 
-def test_every_file_that_is_executed_once_per_variant_is() -> None:
-    root = Path(__file__).parents[1]
-    named = {
-        ".".join(file.relative_to(root).with_suffix("").parts)
-        for file in (root / "mitsuba_ext").rglob("*.py")
-        if "This file is executed once per variant" in file.read_text(encoding="utf-8")
-    }
-    assert named == set(registry._BASES)
+def test_every_class_that_derives_from_mitsuba_is_variant_bound() -> None:
+    """Otherwise it keeps the base class of the first variant when another one is selected."""
+    bound, others = set(), []
+    classes = [
+        node
+        for file in sorted((Path(__file__).parents[1] / "mitsuba_ext").rglob("*.py"))
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    for node in classes:
+        if "variant_bound" in map(ast.unparse, node.decorator_list):
+            bound.add(node.name)
+    for node in classes:
+        bases = {ast.unparse(base) for base in node.bases}
+        derives = bases & bound or any(base.startswith("mi.") for base in bases)
+        if derives and node.name not in bound:
+            others.append(node.name)
+    assert len(bound) > 10
+    assert not others
 
 
 @pytest.mark.parametrize(
@@ -125,7 +137,7 @@ assert mi.Bitmap({str(tmp_path / "image.exr")!r}).width() == 4
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono_polarized"])
 def test_an_unsupported_variant_is_refused_in_a_sentence_that_names_those_that_work(variant):
-    names = registry.plugin_names()["integrators"]
+    names = plugin_folders.plugin_names()["integrators"]
     output = _run(f"""
 import mitsuba_ext, mitsuba as mi
 mi.set_variant({variant!r})

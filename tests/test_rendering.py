@@ -208,7 +208,7 @@ class _Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, compiling: int = 0) -> None:
         self.now, self.compiling = 0.0, compiling
-        run_pass = rendering.Job._run_pass
+        run_pass = rendering.Job.run_pass
 
         def run_on_clock(job, stage, spp):
             run_pass(job, stage, spp)
@@ -216,7 +216,7 @@ class _Clock:
             self.now += 5.0 if self.compiling >= 0 else 0.1 * spp
             return self.compiling >= 0
 
-        monkeypatch.setattr(rendering.Job, "_run_pass", run_on_clock)
+        monkeypatch.setattr(rendering.Job, "run_pass", run_on_clock)
         monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
         monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
 

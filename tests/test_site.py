@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from mitsuba_ext.startup import pages, registry
+from mitsuba_ext.startup import pages, plugin_folders
 
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "site"
-KINDS = registry.plugin_names()
-FILES = {file.stem: file.resolve() for kind in KINDS for file in registry.plugin_files(kind)}
+KINDS = plugin_folders.plugin_names()
+FILES = {file.stem: file.resolve() for kind in KINDS for file in plugin_folders.plugin_files(kind)}
 
 
 @pytest.fixture(scope="module")

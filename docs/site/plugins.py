@@ -23,7 +23,7 @@ from sphinx.parsers import RSTParser
 from sphinx.util.docutils import SphinxDirective, SphinxRole
 from sphinx.util.logging import getLogger
 
-from mitsuba_ext.startup import pages, registry
+from mitsuba_ext.startup import pages, plugin_folders
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -45,8 +45,8 @@ _log = getLogger(__name__)
 @functools.cache
 def kinds() -> dict[str, list[Path]]:
     """The files of each list: those of the registry's kinds, decisions, and base classes."""
-    found = {kind: registry.plugin_files(kind) for kind in registry.plugin_names()}
-    decisions = registry.decision_names()
+    found = {kind: plugin_folders.plugin_files(kind) for kind in plugin_folders.plugin_names()}
+    decisions = plugin_folders.decision_names()
     samplers = found["samplers"]
     found["decisions"] = [file for file in samplers if file.stem in decisions]
     found["samplers"] = [file for file in samplers if file.stem not in decisions]

@@ -26,6 +26,7 @@ from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..images import image_files
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
+from ..startup.registry import variant_bound
 from ..transport.estimator import Estimator
 from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
 from .slots import BIDIRECTIONAL_SLOTS, read_slot
@@ -39,6 +40,7 @@ _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_
 _PASS_BYTES, _LIGHT_BYTES, _CAMERA_BYTES = 1 << 29, 512, 128
 
 
+@variant_bound
 class LightPathIntegrator(WalkIntegrator):
     """Camera paths and light paths, whose vertices are connected."""
 
@@ -71,6 +73,13 @@ class LightPathIntegrator(WalkIntegrator):
     @property
     def most_lanes(self) -> int:
         return _most_lanes(getattr(self.slots.get("light_paths"), "count", 1.0))
+
+    def connects_to(self, scene: mi.Scene, sensor: mi.Sensor) -> bool:
+        """Whether all lights of the scene can emit light paths, and the sensor receives them."""
+        try:
+            return LightSide.of(self.name, scene, sensor).sensor is not None
+        except NotImplementedError:
+            return False
 
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
         if not scene.emitters() or self.max_depth < 2:
@@ -164,6 +173,7 @@ class LightPathIntegrator(WalkIntegrator):
         return image
 
 
+@variant_bound
 class BidirectionalIntegrator(LightPathIntegrator):
     """A :class:`LightPathIntegrator` with the parameters of :class:`bdpt`."""
 

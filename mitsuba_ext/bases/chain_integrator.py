@@ -23,6 +23,7 @@ from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt, interrupted
 from ..rendering.stages import OneStage
+from ..startup.registry import variant_bound
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import with_recordings
 from ..transport.walk import Walk
@@ -50,6 +51,7 @@ class _OnlyAlpha:
         return replace(sample, L=dr.zeros(mi.Spectrum, dr.width(sample.L)))
 
 
+@variant_bound
 class ChainIntegrator(WalkIntegrator):
     """An integrator that renders direct light with camera samples, and the rest with Markov chains.
 

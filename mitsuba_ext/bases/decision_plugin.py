@@ -8,8 +8,10 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..planning.decision_parameters import DecisionParameters, ParameterReader
+from ..startup.registry import variant_bound
 
 
+@variant_bound
 class DecisionPlugin(mi.Sampler):
     """A decision of the walk, with its parameters. For Mitsuba it is a sampler, which can be nested
     in an integrator; it cannot be the sampler of a sensor.

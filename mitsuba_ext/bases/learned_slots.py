@@ -5,15 +5,11 @@ from __future__ import annotations
 from ..planning.decision_parameters import DecisionParameters, ParameterReader
 from ..techniques.guided_directions.parameters import Guided
 from ..techniques.guided_directions.roulette_parameters import GuidedRoulette
-from ..techniques.next_event import LearnedLights
+from ..techniques.learned_lights.parameters import LearnedLights
 from ..techniques.swarming.parameters import MAPS
 
 #: The random numbers of a camera ray that can have learned maps.
 CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
-
-#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
-#: find all light alone. (Guides are learned again.)
-OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
 
 
 def learned_slots(plugin: str) -> dict[str, DecisionParameters]:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
+from ..estimators.light_paths.choice.light_paths import OF_CAMERA_PATHS
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
 from ..techniques.guided_directions.learner import GuideLearner
 from ..techniques.learned_lights.learner import LightMapLearner
-from .learned_slots import CAMERA_NUMBERS, OF_CAMERA_PATHS
+from .learned_slots import CAMERA_NUMBERS
 from .schedule import Schedule
 
 if TYPE_CHECKING:

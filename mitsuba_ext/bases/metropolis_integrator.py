@@ -14,12 +14,14 @@ from ..estimators.chains.target import ImageTarget
 from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..planning.decision_parameters import DecisionParameters, Setting
+from ..startup.registry import variant_bound
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths
 from .chain_integrator import ChainIntegrator
 from .slots import read_slot
 
 
+@variant_bound
 class MetropolisIntegrator(ChainIntegrator):
     """An integrator with Markov chains that mutate the primary samples of paths.
 

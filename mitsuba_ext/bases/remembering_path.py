@@ -15,6 +15,7 @@ from ..rendering.stages import OneStage
 from ..scene.mark import SceneMark
 from ..scene.media import refuse_media
 from ..scene.movers import movers
+from ..startup.registry import variant_bound
 from ..transport.heroes import disperses
 from ..transport.walk import Walk
 from .schedule import Schedule
@@ -44,6 +45,7 @@ class _Remembered:
         self.scene, self.decisions, self.said = scene, decisions, said
 
 
+@variant_bound
 class RememberingPath(WalkIntegrator):
     """The primal renders of :class:`composed_prb`. The first render of a scene learns; the next
     ones use what it has learned, without pilot samples."""

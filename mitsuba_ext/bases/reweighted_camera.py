@@ -11,12 +11,14 @@ import mitsuba as mi
 
 from ..planning.decision_parameters import ParameterReader, Setting
 from ..rendering.stages import Schedule, Stage
+from ..startup.registry import variant_bound
 from ..techniques.weighted_points.camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
 from ..techniques.weighted_points.pixel_sets import PixelSets
 from .staged_integrator import NO_LIMIT
 from .wrapping_integrator import WrappingIntegrator
 
 
+@variant_bound
 class ReweightedCamera(WrappingIntegrator):
     """Renders with a nested integrator. One or two of the numbers that choose a camera ray come
     from weighted point sets.

@@ -13,12 +13,14 @@ import mitsuba as mi
 
 from ..scene.gradients import Optimized
 from ..scene.mark import SceneMark
+from ..startup.registry import variant_bound
 from ..transport.estimator import Estimator
 from ..transport.path_decisions import Weights
 from ..transport.sensitivity import Sensitivity
 from .remembering_path import RememberingPath
 
 
+@variant_bound
 class SensitivePath(RememberingPath):
     """Learns from paths that are weighted by how many optimized things they meet
     (:class:`Sensitivity`): which light, and which direction, is best for the gradients.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..startup.registry import variant_bound
 from ..util.parameters import MOST_SPP, read_parameter
 from ..util.sequences.pixel_order import level_count, shuffled, z_order
 from ..util.sequences.scrambling import mixed
@@ -17,6 +18,7 @@ from ..util.sequences.sequence import Sequence
 _GOLDEN = 0x9E3779B9
 
 
+@variant_bound
 class SequenceSampler(mi.Sampler):
     r"""Each pixel has the same sequence, randomized independently. With blue noise, pixels share
     the points of one sequence instead (``pixel_order.py``).

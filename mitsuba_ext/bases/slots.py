@@ -15,24 +15,39 @@ from ..estimators.light_paths.subpath_choice.parameters import LearnedSubpaths
 from ..planning.decision_parameters import DecisionParameters, ParameterReader
 from ..techniques.guided_directions.parameters import Guided
 from ..techniques.guided_directions.roulette_parameters import GuidedRoulette
+from ..techniques.learned_lights.parameters import LearnedLights
+from ..techniques.linear_lights.parameters import LinearLights
 from ..techniques.mis.parameters import HEURISTICS, MisHeuristic
-from ..techniques.next_event import (
-    CAMERA_METHODS,
-    METHODS,
-    LearnedLights,
-    PortalLights,
-    ResampledLightsChoice,
-    SpatialLights,
-    TwoStageLights,
-)
+from ..techniques.portal_lights.parameters import PortalLights
+from ..techniques.resampled_lights.parameters import ResampledLightsChoice
 from ..techniques.shadow_rejection.parameters import RejectedShadowRays
+from ..techniques.spatial_lights.parameters import PowerLights, SpatialLights
 from ..techniques.swarming.parameters import MAPS
+from ..techniques.two_stage_lights.parameters import TwoStageLights
 from ..techniques.weighted_points.camera_numbers import PURPOSES, WeightedNumbers
 from ..techniques.weighted_points.connections import Connections
 from ..util.errors import did_you_mean
 from ..util.pointsets import PATTERNS
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
+
+#: Ways to choose a light, and what reads the parameters of each; ``None`` for that of ``path``.
+METHODS: dict[str, _Maker | None] = {
+    "uniform": None,
+    "power": lambda read: PowerLights(),
+    "spatial": SpatialLights,
+    "linear": lambda read: LinearLights(),
+    "visibility": lambda read: LearnedLights(read, "visibility"),
+    "contribution": lambda read: LearnedLights(read, "contribution"),
+}
+
+#: Further ways, for integrators without light paths.
+CAMERA_METHODS: dict[str, _Maker] = {
+    "resampled": ResampledLightsChoice,
+    "two_stage": TwoStageLights,
+    "triple_product": lambda read: TwoStageLights(read, "primary"),
+    "portals": PortalLights,
+}
 
 #: For each slot, the words that a scene can give: the name of a decision, and what makes it with
 #: all defaults. ``None`` stands for what Mitsuba's ``path`` does, and comes first. Learners are

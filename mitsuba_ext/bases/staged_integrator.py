@@ -22,6 +22,7 @@ from ..rendering.interrupts import interrupted
 from ..rendering.stages import Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
+from ..startup.registry import variant_bound
 from ..util.parameters import read_parameter
 
 #: Stands for "no limit" in counts.
@@ -31,6 +32,7 @@ NO_LIMIT = 0xFFFFFFFF
 _NOT_OF_THE_IMAGE = ("timeout", "checkpoint", "checkpoint_every")
 
 
+@variant_bound
 class StagedIntegrator(mi.SamplingIntegrator):
     """An integrator that renders in stages and passes (``render.py``).
 

@@ -22,6 +22,7 @@ from ..rendering.stages import Stage
 from ..scene.aovs import check_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
+from ..startup.registry import variant_bound
 from ..techniques.swarming.parameters import Swarm, stage_weights
 from ..techniques.weighted_points.camera_numbers import WeightedNumbers, samples_per_set
 from ..transport.estimator import CameraRays, Estimator
@@ -43,6 +44,7 @@ LEARNING_KERNELS = 6
 _LEAST_SPP = 4
 
 
+@variant_bound
 class WalkIntegrator(StagedIntegrator):
     """An integrator whose samples are random walks.
 

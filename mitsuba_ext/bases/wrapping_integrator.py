@@ -13,10 +13,12 @@ from ..rendering.stages import OneStage, Schedule
 from ..scene.nesting import refuse_checkpoint
 from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
+from ..startup.registry import variant_bound
 from ..transport.estimator import CameraRays, Sample
 from .staged_integrator import StagedIntegrator
 
 
+@variant_bound
 class WrappingIntegrator(StagedIntegrator):
     """An integrator that draws the samples of a nested one. The nested integrator is one of this
     package, which may learn in pilots, or one of Mitsuba's.

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import click
 
-from .. import __version__
 from ..startup.processes import restart_in_utf8
 from ..util.errors import InputError, InstallationError
 from ..util.files import is_utf8, printable
+from ..util.version import __version__
 from .common import INTERRUPTED, say
 from .compare import compare
 from .completion import completion, register

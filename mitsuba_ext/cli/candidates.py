@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..inputs import names
 from ..inputs.scene_changes import FILTERS
-from ..startup import plugin_parameters, registry
+from ..startup import plugin_folders, plugin_parameters
 
 if TYPE_CHECKING:
     import click
@@ -46,7 +46,7 @@ def folders(_context: click.Context, _option: Any, text: str) -> list[Completion
 
 def plugins(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
     """Plugins of this package, of any kind."""
-    found = sorted(name for of_kind in registry.plugin_names().values() for name in of_kind)
+    found = sorted(name for of_kind in plugin_folders.plugin_names().values() for name in of_kind)
     return _items((name, "plain") for name in found if name.startswith(text))
 
 
@@ -96,9 +96,9 @@ def _specifications(text: str) -> list[tuple[str, str]]:
     before, inner = _innermost(text)
     name, colon, rest = inner.partition(":")
     if not colon:
-        known = [*registry.plugin_names()["integrators"], *names.MITSUBA_INTEGRATORS]
+        known = [*plugin_folders.plugin_names()["integrators"], *names.MITSUBA_INTEGRATORS]
         if before:
-            known += registry.decision_names()
+            known += plugin_folders.decision_names()
         return [(before + other, PART) for other in sorted(known) if other.startswith(name)]
     done, comma, last = _last_parameter(rest)
     before += f"{name}:{done}{comma}"

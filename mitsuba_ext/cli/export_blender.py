@@ -83,9 +83,9 @@ def export_blender(output: Path | None) -> int:
 
 def blender_table() -> dict[str, dict[str, Any]]:
     """The entries of our integrators that render images and nest no others."""
-    from ..startup import pages, registry
+    from ..startup import pages, plugin_folders
 
-    found = [pages.read_page(file) for file in registry.plugin_files("integrators")]
+    found = [pages.read_page(file) for file in plugin_folders.plugin_files("integrators")]
     return {page.name: _entry(page) for page in found if not _is_left_out(page)}
 
 

@@ -19,13 +19,13 @@ def list_plugins(name: str | None) -> int:
     """Show the plugins, or the page of the plugin NAME."""
     from rich.table import Table
 
-    from ..startup import pages, registry
+    from ..startup import pages, plugin_folders
 
-    files = {kind: registry.plugin_files(kind) for kind in registry.plugin_names()}
+    files = {kind: plugin_folders.plugin_files(kind) for kind in plugin_folders.plugin_names()}
     console = console_for_tables()
     if name is None:
         overview = Table("plugin", "kind", "what it does")
-        decisions = registry.decision_names()
+        decisions = plugin_folders.decision_names()
         for kind, paths in files.items():
             for path in paths:
                 page = pages.read_page(path)

@@ -6,10 +6,7 @@ from typing import NamedTuple
 
 import mitsuba as mi
 
-from ..estimators.light_paths.emission import LightEmission
-from ..estimators.light_paths.sensor import ConnectableSensor
 from ..inputs.scenes import LoadedScene
-from ..rendering.camera import check_takes_splats
 from ..scene.media import extinction_varies
 from ..scene.movers import all_shapes
 from ..scene.unseen import has_unseen_shapes
@@ -87,12 +84,7 @@ def _missed_light(scene: mi.Scene, has_media: bool) -> str:
 
 def _takes_light_paths(loaded: LoadedScene) -> bool:
     """Can ``bdpt`` render the scene, and connect light paths to its sensor?"""
-    sensor = loaded.scene.sensors()[0]
-    if mi.variant() not in SUPPORTED_VARIANTS or not ConnectableSensor.can_connect(sensor):
+    if mi.variant() not in SUPPORTED_VARIANTS:
         return False
-    try:
-        check_takes_splats(sensor.film())
-        LightEmission(loaded.scene)
-    except NotImplementedError:
-        return False
-    return True
+    scene = loaded.scene
+    return mi.load_dict({"type": "bdpt"}).connects_to(scene, scene.sensors()[0])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..scene.parameter_values import values_of
-from ..startup import registry
+from ..startup import plugin_folders
 
 if TYPE_CHECKING:
     pass
@@ -73,8 +73,8 @@ def hash_code(classes: Iterable[type]) -> str | None:
         for path in _PACKAGE.rglob("*.py")
         if path.relative_to(_PACKAGE).parts[0] not in ("compare", "cli")
     }
-    for kind in registry.plugin_names():
-        files.update(registry.plugin_files(kind))
+    for kind in plugin_folders.plugin_names():
+        files.update(plugin_folders.plugin_files(kind))
     for base in bases:
         try:
             files.add(Path(inspect.getfile(base)))

@@ -14,7 +14,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from ..startup import plugin_parameters, registry
+from ..startup import plugin_folders, plugin_parameters
 from ..util.errors import InputError, did_you_mean
 from .plugin_text import parse_plugin
 
@@ -80,7 +80,7 @@ def explained(message: str) -> str:
     integrator, with the known name that resembles it, if there is one."""
     plugin = re.search(r'Plugin "(\w+)" not found!', message)
     if plugin:
-        known = [name for of_kind in registry.plugin_names().values() for name in of_kind]
+        known = [name for of_kind in plugin_folders.plugin_names().values() for name in of_kind]
         hint = did_you_mean(plugin[1], [*known, *MITSUBA_INTEGRATORS, *_files_of_mitsuba()])
         return message.replace(plugin[0], f"{plugin[0][:-1]}{hint}" if hint else plugin[0])
     unread = re.search(r'unreferenced propert.* plugin of type "(\w+)": \w+ "(\w+)"', message)
@@ -123,8 +123,8 @@ def _check_plugin(plugin: Mapping[str, Any], is_nested: bool = False) -> None:
 
 def _ours(is_nested: bool) -> list[str]:
     """The names of our integrators and, with ``is_nested``, of our decisions."""
-    integrators = registry.plugin_names()["integrators"]
-    return [*integrators, *(registry.decision_names() if is_nested else ())]
+    integrators = plugin_folders.plugin_names()["integrators"]
+    return [*integrators, *(plugin_folders.decision_names() if is_nested else ())]
 
 
 def is_file_of_mitsuba(name: str) -> bool:

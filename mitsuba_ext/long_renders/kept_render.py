@@ -14,9 +14,9 @@ from ..inputs.content_hash import hash_code
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.turns import tell
+from ..scene.fingerprint import fingerprint
 from ..scene.nesting import with_nested
 from ..startup.machine import versions
-from ..techniques.learned_lights.light_map_file import fingerprint
 from .folder import CheckpointFolder
 from .integrator_batches import IntegratorBatches
 from .intervals import Interval, LastKept

@@ -75,6 +75,10 @@ class ParameterReader:
         default = self._defaults.get(key, default)
         return read_parameter(self.plugin, self._props, name, default, **accepted)
 
+    def optional_count(self, key: str, maximum: int) -> int:
+        """A whole number from 1 to ``maximum``; 0 if the scene does not give it."""
+        return self(key, 1, minimum=1, maximum=maximum) if self.is_given(key) else 0
+
     @classmethod
     def of_defaults(
         cls, plugin: str, names: Mapping[str, str] | None = None, **defaults: Any

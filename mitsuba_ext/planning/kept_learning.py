@@ -11,7 +11,7 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from ..techniques.learned_lights.light_map_file import fingerprint
+from ..scene.fingerprint import fingerprint
 
 #: The most renders of which this is kept.
 _MOST = 4

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..techniques.learned_lights.light_map_file import fingerprint
+from ..scene.fingerprint import fingerprint
 from ..util import archives
 from ..util.stored_arrays import StoredArrays
 

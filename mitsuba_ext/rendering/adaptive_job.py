@@ -100,7 +100,7 @@ class AdaptiveJob(Job):
             return None
         return max(1.0, (self.budget.end - time.perf_counter()) / self._seconds_per_sample)
 
-    def _run_pass(self, stage: Stage, spp: int) -> bool:
+    def run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples of every pixel."""
         return self._run_sets(stage, *self.allocation.first(spp))
 

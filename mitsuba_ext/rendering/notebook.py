@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
-
-if TYPE_CHECKING:
-    from .statistics import RenderStatistics
 
 _ROW = Markup("<tr><th>{}</th><td>{}</td></tr>")
 
 
-def statistics_table(statistics: RenderStatistics) -> str:
-    """HTML without styles of its own; all text is escaped."""
+def statistics_table(statistics: Any) -> str:
+    """HTML, without styles of its own, of a ``RenderStatistics``; all text is escaped."""
     rows = Markup("\n").join(_ROW.format(name, text) for name, text in _rows(statistics))
     return str(Markup("<table>\n{}\n</table>").format(rows))
 
 
-def _rows(statistics: RenderStatistics) -> Iterator[tuple[str, str]]:
+def _rows(statistics: Any) -> Iterator[tuple[str, str]]:
     end = ", interrupted" if statistics.interrupted else ""
     passes = f"{statistics.passes} pass{'' if statistics.passes == 1 else 'es'}"
     yield "samples per pixel", f"{statistics.spp:,} in {passes}{end}"

@@ -10,20 +10,36 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
-from .plan import RenderPlan
-from .time_budget import LEARNING_SHARE
+from .plan import Planned, RenderPlan
+from .stages import Stage
+from .statistics import RenderStatistics
+from .time_budget import LEARNING_SHARE, TimeBudget
 
 if TYPE_CHECKING:
-    from .render import Job
+    import mitsuba as mi
 
 #: Seconds that learning takes besides its samples and kernels, about, in any scene: trees and
 #: tables are made on one core of the CPU. (0.3 to 0.6 s in cornell_box, flint and colour_wheel.)
 _FIXED = 0.4
 
 
-def plan_for_timeout(job: Job) -> RenderPlan:
+class PacedJob(Protocol):
+    """The attributes and methods of a render that :func:`plan_for_timeout` uses."""
+
+    integrator: Planned
+    scene: mi.Scene
+    sensor: mi.Sensor
+    plan: RenderPlan
+    budget: TimeBudget
+    statistics: RenderStatistics
+
+    def run_pass(self, stage: Stage, spp: int) -> bool:
+        """Takes samples, and returns whether kernels were compiled."""
+
+
+def plan_for_timeout(job: PacedJob) -> RenderPlan:
     """The plan of a render, whose pilots are those of a render of as many samples as the time
     allows. Renders without a timeout or pilots, or whose passes must have the same length, keep
     their plan."""
@@ -36,7 +52,7 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     compiling, is_new = 0.0, True
     while is_new:
         begin, before = time.perf_counter(), _tracing(job)
-        is_new = job._run_pass(stage, budget.short)
+        is_new = job.run_pass(stage, budget.short)
         # Long passes take no longer to trace than this one: their speed is that of the kernel
         tracing = _tracing(job) - before
         seconds = time.perf_counter() - begin - tracing
@@ -52,6 +68,6 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     return replace(plan, stages=(*pilots, fits - taken - sum(pilots)))
 
 
-def _tracing(job: Job) -> float:
+def _tracing(job: PacedJob) -> float:
     """Seconds before kernels could run."""
     return job.statistics.compile_seconds + job.statistics.tracing_seconds

@@ -234,7 +234,7 @@ class Job:
                 self.splats = None
             if stage.images is not None and done == 0:
                 stage.images.begin(self.block, self.splats, before)
-            compiled = self._run_pass(stage, spp)
+            compiled = self.run_pass(stage, spp)
             done += spp
             if stage.images is not None:
                 stage.images.add(self.block, self.splats, before + done)
@@ -318,7 +318,7 @@ class Job:
             dr.eval(pixel)
             stage.observer.begin(lanes.count, pixel)
 
-    def _run_pass(self, stage: Stage, spp: int) -> bool:
+    def run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block. Returns True if it compiled a
         kernel."""
         begin = time.perf_counter()

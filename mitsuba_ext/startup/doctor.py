@@ -20,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import __version__
+from ..util.version import __version__
 from . import llvm, runtime
 from .processes import python_command
 

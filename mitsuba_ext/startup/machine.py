@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 
-from .. import __version__
+from ..util.version import __version__
 
 
 def versions() -> dict[str, str]:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..util.errors import did_you_mean
-from . import registry
 from .pages import Parameter, read_page
+from .plugin_folders import KINDS, plugin_files
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 @functools.cache
 def parameter_rows(name: str) -> list[Parameter]:
     """The rows of the parameter table of a plugin of this package; none for other plugins."""
-    files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
-    pages = [read_page(file) for file in files if file.stem == name]
+    files = (file for kind in KINDS for file in plugin_files(kind) if file.stem == name)
+    pages = [read_page(file) for file in files]
     return [row for page in pages for row in page.parameters]
 
 

@@ -126,3 +126,12 @@ def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:
     return dr.if_stmt(
         arguments, active, lambda *values: function(*values), lambda *_values: mi.Float(0)
     )
+
+
+def sampling_weights(scene: mi.Scene) -> LightTable:
+    """The light sampling of ``path``, but with the true densities of points on meshes with
+    interpolated normals."""
+    cells = LightCells(scene, None)
+    number = from_numpy(mi.UInt32, cells.emitter_index)
+    probability = np.broadcast_to(scene.pdf_emitter(number).numpy(), cells.count)
+    return LightTable(OneRow(), cells, from_numpy(mi.Float, probability * cells.share))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from ...rendering.camera import check_takes_splats
-from ...techniques.next_event import sampling_weights
+from ...transport.light_table import sampling_weights
 from ...transport.path_decisions import EmitterSampling
 from .both_ends import FromBothEnds
 from .emission import LightEmission

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...scene.fingerprint import digest, fingerprint
 from ...scene.lights.division import emitter_shapes
 from ...scene.lights.light_cells import LightCells
 from ...scene.regions.surface_rows import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
@@ -145,34 +144,11 @@ def _too_large(memory: int, max_memory: int) -> _TooLargeError:
     )
 
 
-# ---- Fingerprints of scenes and lights ----
-
-
-def fingerprint(scene: mi.Scene) -> str:
-    """A hash of shapes, materials and lights, without sensors and films."""
-    # Sorted: their order differs from one loading of a scene to the next
-    digests = sorted(_of(part) for part in [*scene.shapes(), *scene.emitters()])
-    return hashlib.sha256(b"".join(digests)).hexdigest()
-
-
 def _cell_order(scene: mi.Scene, cells: LightCells) -> np.ndarray:
     """The cells of a scene in the order of their lights' digests. Equal lights at one place are
     interchangeable."""
     lights = zip(scene.emitters(), emitter_shapes(scene))
-    digests = [_of(emitter) + (_of(shape) if shape else b"") for emitter, shape in lights]
+    digests = [digest(emitter) + (digest(shape) if shape else b"") for emitter, shape in lights]
     rank = np.empty(len(digests), dtype=int)
     rank[sorted(range(len(digests)), key=digests.__getitem__)] = np.arange(len(digests))
     return np.argsort(rank[cells.emitter_index], kind="stable")
-
-
-def _of(scene_object: mi.Object) -> bytes:
-    digest = hashlib.sha256(scene_object.class_name().encode())
-    parameters = mi.traverse(scene_object)
-    for key in sorted(parameters.keys()):
-        value = parameters[key]
-        digest.update(key.encode())
-        if dr.is_tensor_v(value):
-            value = value.array
-        digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value)
-                      else repr(value).encode())
-    return digest.digest()

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 from ...planning.learner import Learner
 from ..learned_lights.learner import LightMapLearner
-from ..next_event import LearnedLights
+from ..learned_lights.parameters import LearnedLights
 from .light_map_roulette_learner import LightMapRouletteLearner
 from .visibility_roulette import has_lights_at_points
 from .visibility_roulette_learner import VisibilityRouletteLearner

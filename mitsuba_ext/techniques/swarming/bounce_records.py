@@ -19,7 +19,8 @@ class BounceRecords:
 
     Attributes:
         map, cell, density: For each record, see
-            :class:`~mitsuba_ext.techniques.swarming.tile_counts.Choices`; density 0 where there is none.
+            :class:`~mitsuba_ext.techniques.swarming.tile_counts.Choices`. The density is 0 where
+            there is none.
         lane: The lane of each record.
     """
 

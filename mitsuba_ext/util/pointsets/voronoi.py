@@ -41,8 +41,8 @@ def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArra
     - with ``"torus"``: unbiased in every dimension for independent uniform points, and for *any*
       points after a uniform random shift around the torus
       (:func:`~mitsuba_ext.util.pointsets.shifted`), because all positions are then equally likely.
-      If f differs at opposite ends, evaluate it at ``tent(points)`` instead: still unbiased, and without
-      the discontinuity at the border.
+      If f differs at opposite ends, evaluate it at ``tent(points)`` instead: still unbiased, and
+      without the discontinuity at the border.
 
     Parameters:
         points: Of shape (N,) or (N, D), with D = 1, 2 or 3.

@@ -11,7 +11,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ....bases.learned_slots import OF_CAMERA_PATHS
 from ....images.coarse_film import CoarseFilm
 from ....planning.benefit import SEGMENT, SHADOW, expected_gain
 from ....planning.decision_parameters import DecisionParameters, Setting, Slots
@@ -46,6 +45,10 @@ _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 #: Guided directions are expected to keep this power of their efficiency beside light paths. (The
 #: first pilots with both have guides of few samples, and show less.)
 _KEPT = 0.5
+
+#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
+#: find all light alone. (Guides are learned again.)
+OF_CAMERA_PATHS = ("directions", "roulette", "time", "aperture", "wavelength", "distance")
 
 #: The least share of missing light of which a render tells.
 _WORTH_A_WORD = 1e-3

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ....bases.learned_slots import OF_CAMERA_PATHS
 from ....images.box_filter import box_means
 from ....images.coarse_film import CoarseFilm
 from ....planning.benefit import gain_of, is_worth, trimmed_batches
@@ -28,7 +27,7 @@ from ..path_tracer import camera_paths
 from ..photons.photon_history import HiddenLight
 from ..photons.photon_mapper import PhotonMapper
 from .candidates import Candidate
-from .light_paths import cost
+from .light_paths import OF_CAMERA_PATHS, cost
 from .path_moments import Counts
 from .technique_observer import TechniqueObserver
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import mitsuba as mi
 
 from ....scene.bsdfs import refuse_clear_curves
 from ....scene.media import may_have_media
-from ....transport.path_decisions import NoConnections
+from ....transport.path_decisions import NoConnections, SceneQuery
 from ....transport.walk import Walk
 from ..emission import LightEmission
 from ..light_media import outer_medium
@@ -16,12 +16,22 @@ from ..light_walk import LightWalk
 from ..merging.merging_parameters import MergingParameters
 from .photon_mapper import PhotonMapper
 
-if TYPE_CHECKING:
-    from ....bases.walk_integrator import WalkIntegrator
+
+class PathIntegrator(Protocol):
+    """The attributes and methods of an integrator that :func:`photon_mapper` uses."""
+
+    name: str
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+    samples_before: int
+
+    def query(self, scene: mi.Scene) -> SceneQuery:
+        """How rays are intersected with the scene."""
 
 
 def photon_mapper(
-    integrator: WalkIntegrator,
+    integrator: PathIntegrator,
     scene: mi.Scene,
     sensor: mi.Sensor,
     merging: MergingParameters,

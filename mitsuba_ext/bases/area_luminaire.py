@@ -8,10 +8,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext.scene.luminaires.surface import Surface
-from mitsuba_ext.scene.luminaires.surfaces import surface
+from ..scene.luminaires.surface import Surface
+from ..scene.luminaires.surfaces import surface
+from ..startup.registry import variant_bound
 
 
+@variant_bound
 class AreaLuminaire(mi.Emitter):
     """An emitter on a shape. Its radiance is a spectrum or texture, times the value of
     :meth:`profile` for the direction. Light leaves to the side of the shading normal, as from

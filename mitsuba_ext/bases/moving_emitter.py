@@ -9,9 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.scene.motion.rigid_motion import Motion, Pose, PoseTable
+from ..scene.motion.rigid_motion import Motion, Pose, PoseTable
+from ..startup.registry import variant_bound
 
 
+@variant_bound
 class MovingEmitter(mi.Emitter):
     """A moving emitter. For each call, points and directions are transformed to the frame in which
     ``nested`` rests, by the pose at the time of the call, and the results are transformed back.

@@ -1,0 +1,30 @@
+"""Hashes of scenes and of their parts, which are the same in each process."""
+
+from __future__ import annotations
+
+import hashlib
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def fingerprint(scene: mi.Scene) -> str:
+    """A hash of shapes, materials and lights, without sensors and films."""
+    # Sorted: their order differs from one loading of a scene to the next
+    digests = sorted(digest(part) for part in [*scene.shapes(), *scene.emitters()])
+    return hashlib.sha256(b"".join(digests)).hexdigest()
+
+
+def digest(scene_object: mi.Object) -> bytes:
+    """A hash of the class and the parameters of a shape, an emitter or a material."""
+    state = hashlib.sha256(scene_object.class_name().encode())
+    parameters = mi.traverse(scene_object)
+    for key in sorted(parameters.keys()):
+        value = parameters[key]
+        state.update(key.encode())
+        if dr.is_tensor_v(value):
+            value = value.array
+        state.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value)
+                     else repr(value).encode())
+    return state.digest()

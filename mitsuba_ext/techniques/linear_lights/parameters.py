@@ -1,0 +1,19 @@
+"""The parameters of linear light selection: it has none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...planning.decision_parameters import DecisionParameters, Setting
+from .linear_lights import LinearChoice
+
+
+class LinearLights(DecisionParameters):
+    """Chooses lights by an estimate of what each contributes to the vertex."""
+
+    name = "linear"
+    slots = ("next_event",)
+    sees_media = False
+
+    def decision(self, setting: Setting) -> Any | None:
+        return LinearChoice(setting.scene) if len(setting.scene.emitters()) > 1 else None

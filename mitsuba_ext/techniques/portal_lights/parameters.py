@@ -1,0 +1,27 @@
+"""The parameters of portal sampling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...scene.portals import portals
+from .portal_sampling import PortalSampling
+
+
+class PortalLights(DecisionParameters):
+    """Samples directions of the environment through portals. The attributes are the parameters of
+    the plugin ``portal_lights``; see there."""
+
+    name = "portal_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.share = read("share", 0.9, minimum=0.0, maximum=0.99)
+
+    def decision(self, setting: Setting) -> Any | None:
+        scene = setting.scene
+        if scene.environment() is None or not portals(scene) or self.share == 0:
+            return None
+        return PortalSampling(scene, self.share)

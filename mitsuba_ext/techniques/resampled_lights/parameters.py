@@ -1,0 +1,33 @@
+"""The parameters of resampled lights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from .resampled_lights import ResampledLights
+
+#: Number of candidates that take about as long as a path.
+_CANDIDATES_PER_PATH = 32
+
+
+class ResampledLightsChoice(DecisionParameters):
+    """Chooses one of several candidate lights by what each would contribute. The attributes are the
+    parameters of the plugin ``resampled_lights``; see there."""
+
+    name = "resampled_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+    sees_media = False
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.candidates = read("candidates", 8, minimum=1, maximum=1024)
+
+    @property
+    def sample_cost(self) -> int:
+        return 1 + self.candidates // _CANDIDATES_PER_PATH
+
+    def decision(self, setting: Setting) -> Any | None:
+        if not setting.scene.emitters():
+            return None
+        return ResampledLights(setting.scene, self.candidates)

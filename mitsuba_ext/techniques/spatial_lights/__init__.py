@@ -1,0 +1,1 @@
+"""Lights that are chosen by their power, also from each voxel."""
