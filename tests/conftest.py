@@ -5,21 +5,22 @@ from __future__ import annotations
 import gc
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-import quick_kernels  # noqa: F401  isort: skip  (before drjit)
-from noisy import Clock
+import tests.support.quick_kernels  # noqa: F401  isort: skip  (before drjit)
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
 from mitsuba_ext import cli
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.compare import timing
 from mitsuba_ext.transport.frozen import forget_recordings
+from tests.support.clock import Clock
+from tests.support.command_line import PATH, SCENE, SPHERE
+from tests.support.paths import ROOT
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -78,7 +79,7 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
 @pytest.fixture(scope="session")
 def scenes() -> Path:
     """The folder of our scene files."""
-    return Path(__file__).parents[1] / "scenes"
+    return ROOT / "scenes"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -122,34 +123,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 # ---- The command line ----
 
-SCENE = """<scene version="3.0.0">
-  <default name="spp" value="4"/>
-  {integrator}
-  <sensor type="perspective">
-    <float name="fov" value="45"/>
-    <film type="hdrfilm">
-      <integer name="width" value="8"/>
-      <integer name="height" value="6"/>
-      <rfilter type="box"/>
-      {film}
-    </film>
-    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
-  </sensor>
-  <emitter type="constant"/>
-  {body}
-</scene>
-"""
-
-SPHERE = """<shape type="sphere">
-    <transform name="to_world"><translate z="5"/></transform>
-    <bsdf type="diffuse"/>
-  </shape>"""
-
-PLAIN_PATH = '<integrator type="path"><integer name="max_depth" value="3"/></integrator>'
-
-#: With a parameter of its own, it is not replaced by ``auto`` in ``mitsuba-ext render``.
-PATH = PLAIN_PATH.replace("</", '<float name="timeout" value="-1"/></', 1)
-
 
 @pytest.fixture
 def make_scene(tmp_path):
@@ -171,11 +144,6 @@ def run(capsys):
         return code, captured.out, captured.err
 
     return command
-
-
-def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "mitsuba_ext", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
 
 
 @pytest.fixture(autouse=True)

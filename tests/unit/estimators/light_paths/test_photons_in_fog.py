@@ -1,0 +1,147 @@
+"""Photons in participating media: ``sppm`` in fog."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.estimators.light_paths.light_media import outer_medium
+from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
+from mitsuba_ext.transport.path_decisions import SceneQuery
+from tests.support.fogs import camera, cube, fog, fog_around_the_camera, grid, homogeneous
+from tests.support.stage import area, diffuse, lookat, sensor
+from tests.support.statistical import assert_images_are_sound, assert_same_quarters, batches, some
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: In passes of 1024 samples per pixel, balls have a tenth of this radius.
+_RADII = {"radius": 0.1, "radius_in_media": 0.3}
+
+
+def make(name: str = "sppm", max_depth: int = 6, **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": name, "max_depth": max_depth, **parameters})
+
+
+def _glass_in_fog() -> dict:
+    ball = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"},
+            "exterior": {"type": "ref", "id": "around"}}  # fmt: skip
+    return {**fog_around_the_camera("area", homogeneous(0.2)), "ball": ball}
+
+
+def _without_boundary() -> dict:
+    """Fog everywhere: only the sensor knows of it."""
+    scene = {k: v for k, v in fog("area_inside").items() if k != "fog"}
+    return {**scene, "sensor": {**scene["sensor"], "medium": homogeneous(0.1)}}
+
+
+SCENES = {
+    "lamp_outside": lambda: fog("area"),
+    "lamp_inside": lambda: fog("area_inside"),
+    "point_inside": lambda: fog("point_inside"),
+    "sky": lambda: fog("environment"),
+    "sun": lambda: fog("directional"),
+    "chromatic": lambda: fog("area", homogeneous([0.2, 0.5, 0.9], [0.9, 0.6, 0.3])),
+    "forward": lambda: fog("area", homogeneous(g=0.8)),
+    "backward": lambda: fog("area", homogeneous(g=-0.6)),
+    "thick": lambda: fog("area", homogeneous(8.0, 0.95)),
+    "grid": lambda: fog("area", grid()),
+    "around_the_camera": lambda: fog_around_the_camera("area_inside", homogeneous(0.2)),
+    "without_boundary": _without_boundary,
+    "nested": lambda: fog("area", inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
+    "without_emitter_sampling": lambda: fog("area", homogeneous(sample_emitters=False)),
+    "glass_in_fog": _glass_in_fog,
+}
+
+
+@pytest.mark.parametrize("name", some("chromatic", of=SCENES))
+def test_fog_has_the_mean_of_volpath(name: str) -> None:
+    scene = mi.load_dict(SCENES[name](), optimize=False)
+    found = batches(scene, make(**_RADII), 1024, range(1, 7))
+    expected = batches(scene, make("volpath"), 1024, range(101, 107))
+    assert_same_quarters(found, expected, 0.04)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_spectral_fog_has_the_mean_of_volpath(variant: str) -> None:
+    scene = mi.load_dict(fog("environment"), optimize=False)
+    # Photons of a pass have wavelengths of their own: its samples do not shrink the radius
+    parameters = {"radius": 0.05, "radius_in_media": 0.06}
+    found = batches(scene, make(**parameters), 1024, range(1, 9))
+    assert_same_quarters(found, batches(scene, make("volpath"), 1024, range(101, 109)), 0.03)
+
+
+def test_white_fog_in_a_white_world_is_invisible_but_for_the_bias_at_its_surface() -> None:
+    """Where a ball reaches out of the fog, it finds too little. That falls with the radius."""
+    scene = mi.load_dict({"type": "scene", "sensor": camera(), "fog": cube(homogeneous(2.0, 1.0)),
+                          "sky": {"type": "constant"}}, optimize=False)  # fmt: skip
+    missing = []
+    for radius in (0.2, 0.05):
+        parameters = {"radius_in_media": radius * 64 ** (1 / 3), "radius_decay": 1.0}
+        images = batches(scene, make(max_depth=-1, **parameters), 64, range(1, 3))
+        assert_images_are_sound(images)
+        # 27 % of the film show the fog
+        missing.append(1 - images.mean())
+    assert 0.01 < missing[0] < 0.06 and abs(missing[1]) < 0.4 * missing[0]
+
+
+def _lamp_in_fog(size: float) -> mi.Scene:
+    T = mi.ScalarTransform4f
+    view = lookat([0, 0.3 * size, 6 * size], [0, 0, 0], [0, 1, 0])
+    lamp = {"type": "sphere", "radius": 0.3 * size, "emitter": area(5.0), "bsdf": diffuse(0.0)}
+    floor = {"type": "rectangle", "bsdf": diffuse(0.5),
+             "to_world": T().translate([0, -0.8 * size, 0]).rotate([1, 0, 0], -90).scale(2 * size)}
+    return mi.load_dict({
+        "type": "scene", "lamp": lamp, "floor": floor,
+        "fog": cube(homogeneous(1 / size), size),
+        "sensor": sensor(to_world=view, fov=30.0, near_clip=0.01 * size, far_clip=100 * size),
+    }, optimize=False)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-3, 1e4])
+def test_the_size_of_the_scene_does_not_matter(size: float) -> None:
+    images = [batches(_lamp_in_fog(s), make(max_depth=5), 16, range(1, 5)) for s in (1.0, size)]
+    assert_images_are_sound(images[1])
+    assert images[1].mean() == pytest.approx(images[0].mean(), rel=0.03)
+
+
+def test_balls_shrink_in_volume_as_disks_do_in_area() -> None:
+    radius = MergingRadius(2.0, 0.75, pixels=100, footprint=0.1, dimensions=3)
+    found = [radius.next(100) for _ in range(16)]
+    assert found[0] == 2 and found[15] == pytest.approx(2 * 16 ** (-1 / 12))
+    assert MergingRadius(2.0, 0.75, 100, 0.1, dimensions=3).next(800) == pytest.approx(1)
+
+
+def test_the_medium_outside_is_that_behind_the_last_boundary() -> None:
+    def outside(scene: dict) -> bool:
+        loaded = mi.load_dict(scene)
+        medium = outer_medium(SceneQuery(), loaded, loaded.sensors()[0])
+        return bool(dr.all(medium != None))  # noqa: E711
+
+    assert outside(_without_boundary())
+    assert not outside(fog()) and not outside(fog_around_the_camera())
+    hole = {"type": "sphere", "radius": 3.0, "bsdf": {"type": "null"}, "exterior": homogeneous()}
+    assert outside({**_without_boundary(), "hole": hole})
+
+
+@pytest.mark.parametrize("name", ["vcm", "bdpt", "photon_map"])
+def test_others_with_light_paths_refuse_media_and_name_sppm(name: str) -> None:
+    with pytest.raises(NotImplementedError, match='do not scatter in a medium.*"sppm"'):
+        make(name).render(mi.load_dict(fog()), spp=1)
+
+
+def test_a_small_lamp_through_glass_lights_the_fog() -> None:
+    """A point light, which ``volpath`` cannot reach through the glass."""
+    ball = {"type": "sphere", "center": [0, 1.4, 0], "radius": 0.35, "bsdf": {"type": "dielectric"}}
+    spot = {"type": "spot", "cutoff_angle": 10.0, "intensity": 50.0,
+            "to_world": lookat([0, 3, 0], [0, 1, 0], [1, 0, 0])}  # fmt: skip
+    scene = mi.load_dict(fog(light="point") | {"light": spot, "ball": ball}, optimize=False)
+    image = np.array(mi.render(scene, integrator=make(), spp=256)).mean(axis=2)
+    # Below the ball, the light crosses the axis of the picture
+    assert image[6:10, 7:9].mean() > 5 * image[6:10, 4:6].mean() > 0
+    assert np.array(mi.render(scene, integrator=make("volpath"), spp=16)).max() == 0

@@ -1,0 +1,194 @@
+"""``auto`` begins as ``path``, and tries light paths between the pilots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.estimators.light_paths.choice import light_paths
+from tests.support.emitters_and_materials import EMITTERS, below_the_lamp
+from tests.support.fogs import fog
+from tests.support.stage import stage
+from tests.support.statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_image,
+    assert_same_quarters,
+    batches,
+    load,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.fixture(autouse=True)
+def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(light_paths, "_SPARSE", 1 << 12)
+
+
+def auto(**parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": "auto", "max_depth": 6, **parameters})
+
+
+def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None = None) -> str:
+    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
+    integrator = integrator or auto()
+    integrator.render(scene, spp=spp, seed=1)
+    return integrator.statistics.learned
+
+
+def test_a_render_that_is_too_short_to_learn_says_that_it_is_path() -> None:
+    assert learned(stage(), 4) == "nothing: with fewer than 262144 samples, it is path"
+    assert "262144 samples (with fewer, it is path)" in str(auto())
+
+
+def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> None:
+    integrator = auto()
+    text = learned(load("caustic", width=96, height=54), 64, integrator)
+    assert "light paths pay: " in text and "guide: " not in text
+    effects = integrator.statistics.effects
+    assert "directions" not in effects and "next_event" not in effects
+    light_paths = effects["light_paths"]
+    assert light_paths["is_kept"] and light_paths["light_paths"] > 0
+    assert f"({light_paths['variance']:.2f} of the variance" in text
+    assert f"{light_paths['time']:.1f} x the time" in text
+
+
+def test_guides_that_paid_are_learned_again_beside_light_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0.0)
+    integrator = auto()
+    scene = load("corridor", width=96, height=54)
+    text = learned(scene, 64, integrator)
+    assert "guide: " in text and "light paths pay: " in text
+    assert integrator.statistics.effects["directions"]["is_kept"]
+    assert "roulette" not in integrator.learners
+
+
+def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, estimates = load("cornell_box", width=64, height=36), []
+    trials: list[light_paths.LightPathTrial] = []
+    made = light_paths.LightPathTrial.__init__
+
+    def remembered(trial: light_paths.LightPathTrial, *arguments: Any, **options: Any) -> None:
+        made(trial, *arguments, **options)
+        trials.append(trial)
+
+    monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
+    monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    for samples in (1 << 10, 1 << 14):
+        monkeypatch.setattr(light_paths, "_SPARSE", samples)
+        auto().render(scene, spp=32, seed=1)
+        estimates.append((trials[-1].estimate.mean.mean(), trials[-1].predicted.variances[:8]))
+    (coarse, few), (whole, many) = estimates
+    assert len(trials[0].samples) < 64 * 36 < len(trials[1].samples)
+    assert coarse == pytest.approx(whole, rel=0.1)
+    np.testing.assert_allclose(few, many, rtol=0.35)
+
+
+def test_light_paths_are_left_out_under_an_open_sky() -> None:
+    scene = stage(light=EMITTERS["constant"](), camera=below_the_lamp())
+    assert "light paths do not pay" in learned(scene, 1200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["rectangle", "constant"])
+def test_the_choice_does_not_change_the_mean(light: str) -> None:
+    scene = mi.load_dict(stage(light=EMITTERS[light](), camera=below_the_lamp()), optimize=False)
+    integrator = auto(max_depth=4)
+    images = batches(scene, integrator, 1200, SEEDS[:MANY_SEEDS])
+    assert "light paths" in integrator.statistics.learned
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    expected = batches(scene, path, 1200, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["moving glass and a lens", "spectral"])
+def test_light_paths_take_the_place_of_maps_and_keep_the_mean(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Although the render is short
+    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0)
+    ball = {"type": "sphere", "center": [-0.3, 0, 0.5], "radius": 0.4,
+            "bsdf": {"type": "dielectric"}}  # fmt: skip
+    camera = below_the_lamp()
+    if case == "spectral":
+        mi.set_variant("llvm_ad_spectral")
+    else:
+        ball = {"type": "moving", "translate": [0.6, 0, 0], "in": ball}
+        camera = below_the_lamp("thinlens", aperture_radius=0.1, focus_distance=4.0,
+                                shutter_open=0.0, shutter_close=1.0)  # fmt: skip
+    scene = mi.load_dict(stage(camera=camera, ball=ball), optimize=False)
+    integrator = auto(max_depth=5)
+    images = batches(scene, integrator, 1024, SEEDS[:MANY_SEEDS])
+    text = integrator.statistics.learned
+    assert "light paths pay: 1 for each camera path" in text and "merging" not in text
+    assert not any(word in text for word in ("times:", "lens:", "wavelengths:"))
+    path = mi.load_dict({"type": "composed_path", "max_depth": 5})
+    expected = batches(scene, path, 4096, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.03)
+
+
+def test_short_renders_learn_nothing() -> None:
+    scene = load("cornell_box", width=32, height=18)
+    images = [
+        batches(scene, mi.load_dict({"type": name, "max_depth": 4}), 32, [3])[0]
+        for name in ("auto", "composed_path")
+    ]
+    assert_same_image(*images)
+
+
+def test_where_light_paths_cannot_be_tried_it_is_auto_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    scene = mi.load_dict(fog("area"))
+    images = []
+    for name in ("auto", "auto_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 4})
+        images.append(np.array(integrator.render(scene, spp=64, seed=2)))
+        assert "light paths" not in integrator.statistics.learned
+    assert_same_image(*images)
+
+
+def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
+    file = str(tmp_path / "learned.npz")
+    scene = load("caustic", width=96, height=54)
+    text = learned(scene, 64, auto(save_learned=file))
+    again = learned(scene, 4, auto(load_learned=file))
+    assert "light paths pay: " in again
+    choice = text.rpartition("light paths")[2].partition(" (")[0]
+    assert again.endswith(f"light paths{choice}")
+
+
+@pytest.mark.slow
+def test_equal_seeds_give_equal_images() -> None:
+    scene = load("caustic", width=96, height=54)
+    images = [np.array(auto().render(scene, spp=64, seed=4)) for _ in range(2)]
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-4)
+
+
+def test_integrators_that_distribute_samples_refuse_it() -> None:
+    with pytest.raises(RuntimeError, match='use "auto_path"'):
+        mi.load_dict({"type": "adaptive", "nested": {"type": "auto"}})
+
+
+def test_samples_before_light_paths_are_left_out_where_these_have_far_less_variance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = load("caustic", width=96, height=54)
+    weights, images = [], []
+    for least in (0.4, 0.0):
+        monkeypatch.setattr(light_path_schedule, "_FAR_LESS", least)
+        images.append(np.array(auto().render(scene, spp=64, seed=4)))
+        weights.append(np.array(scene.sensors()[0].film().develop(raw=True))[..., -1].mean())
+    assert weights[0] < 0.95 * weights[1]
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.05)

@@ -1,0 +1,211 @@
+"""``bdpt`` shows the image of ``path``."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.bdpt import assert_image_of_path, bdpt
+from tests.support.emitters_and_materials import (
+    EMITTERS,
+    MATERIALS,
+    T,
+    below_the_lamp,
+    stage_with_ball,
+)
+from tests.support.hard_cases import _delta_lights, _instances
+from tests.support.stage import _octahedron, area, diffuse, film, rectangle, sensor, stage
+from tests.support.statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_quarters,
+    batches,
+    load,
+    some,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.mark.parametrize("name", some("sphere", of=EMITTERS))
+def test_every_emitter_lights_the_scene_as_in_path(name: str) -> None:
+    assert_image_of_path(stage(light=EMITTERS[name](), camera=below_the_lamp()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_beams_and_lamps_of_any_texture_light_the_same_scene(name: str) -> None:
+    """Mitsuba cannot choose points of a checkerboard."""
+    down = T().translate([0.5, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
+    lights = {
+        "beam": rectangle(down, emitter={"type": "directionalarea"}),
+        "lamp": rectangle(down, T().translate([2, 0, 0]), bsdf=diffuse(0.0),
+                          emitter={"type": "area", "radiance": {"type": "checkerboard"}}),
+    }
+    integrator = mi.load_dict({"type": name, "max_depth": 3})
+    alone = [
+        batches(mi.load_dict(stage(light=light)), integrator, 512, [1]).mean()
+        for light in lights.values()
+    ]
+    both = batches(mi.load_dict(stage(light={}, **lights)), integrator, 512, [2]).mean()
+    assert min(alone) > 0.01 * both
+    assert both == pytest.approx(sum(alone), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_a_lamp_with_interpolated_normals_sends_out_what_camera_rays_see(name: str) -> None:
+    """Where next event estimation of ``path`` errs."""
+    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))
+    scene = mi.load_dict(stage(light=lamp, camera=below_the_lamp()), optimize=False)
+    by_hits = mi.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
+    integrator = mi.load_dict({"type": name, "max_depth": 2})
+    images = batches(scene, integrator, 512, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, by_hits, 4096, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.005)
+
+
+@pytest.mark.parametrize("name", some(of=MATERIALS))
+def test_a_material_reflects_light_as_in_path(name: str) -> None:
+    assert_image_of_path(stage_with_ball(MATERIALS[name]()))
+
+
+@pytest.mark.parametrize("kind", some("dielectric", of=["dielectric", "conductor", "plastic"]))
+def test_caustics_are_those_of_path(kind: str) -> None:
+    assert_image_of_path(stage_with_ball({"type": kind}), 5, precision=0.01)
+
+
+def test_instances_of_a_group_with_several_shapes_are_read_back_as_they_are() -> None:
+    assert_image_of_path({**_instances(), "sensor": below_the_lamp()}, 3, 512)
+
+
+CAMERAS = {
+    "thinlens": {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
+    "orthographic": {"plugin": "orthographic"},
+    "cropped": {"film": film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13,
+                             crop_height=11, rfilter={"type": "gaussian"})},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", some("thinlens", of=CAMERAS))
+def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
+    camera = below_the_lamp(**CAMERAS[name])
+    if name == "orthographic":
+        del camera["fov"]
+        camera["to_world"] = camera["to_world"] @ T().scale([2, 2, 1])
+    assert_image_of_path(stage(camera=camera), precision=0.01)
+
+
+_HALF = {"type": "visibility_roulette", "slope": 0.0, "floor": 0.5}
+
+PARAMETERS = {
+    "no light image": {"light_image": False},
+    "three connections": {"connections": 3},
+    "guided": {"directions": "guided"},
+    "spatial": {"next_event": "spatial"},
+    "linear": {"next_event": "linear"},
+    "half of the shadow rays": {"shadow_test": _HALF},
+    "all decisions": {
+        "directions": {"type": "guided_directions", "always_guide": True},
+        "next_event": {"type": "learned_lights", "grid": 8},
+        "shadow_test": _HALF, "connections": 2, "pilot_spp": 32,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", some(of=PARAMETERS))
+def test_parameters_do_not_change_the_mean(name: str) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp(), sky={"type": "constant"}),
+                         **PARAMETERS[name])  # fmt: skip
+
+
+@pytest.mark.parametrize("max_depth", some(-1, of=[1, 2, 3, -1]))
+def test_paths_are_as_long_as_those_of_path(max_depth: int) -> None:
+    scene = stage() if max_depth == 1 else stage(camera=below_the_lamp())
+    assert_image_of_path(scene, max_depth, precision=0.03, both={"rr_depth": 2})
+
+
+@pytest.mark.slow
+def test_hidden_emitters_are_looked_through() -> None:
+    lamp = rectangle(T().translate([0, -1, 1]).rotate([1, 0, 0], -90).scale(0.3),
+                     emitter=EMITTERS["rectangle"]()["emitter"])  # fmt: skip
+    assert_image_of_path(stage(light=lamp, sky={"type": "constant"}), both={"hide_emitters": True})
+
+
+@pytest.mark.slow
+def test_points_and_directions_of_light_agree() -> None:
+    assert_image_of_path(_delta_lights(), precision=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
+@pytest.mark.parametrize("connections", [1, 3])
+def test_variants_show_the_image_of_path(variant: str, connections: int) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp()), connections=connections)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_dispersed_light_is_that_of_the_path_tracer(variant: str) -> None:
+    scene = load("flint", width=24, height=24)
+    assert_image_of_path(scene, 4, 256, 0.01, reference="composed_path")
+
+
+def test_parts_of_the_film_share_the_light_of_all_light_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = mi.load_dict(stage(camera=below_the_lamp(film=film(48, 48))))
+    monkeypatch.setattr(type(bdpt()), "most_lanes", 48 * 48 // 2)
+    assert_image_of_path(scene, spp=8)
+
+
+def test_shadow_rays_are_counted() -> None:
+    """At most one for each connection: to a light and to a light path from each of 3 vertices, and
+    to the sensor from each of 3."""
+    integrator = bdpt(4)
+    batches(mi.load_dict(stage(camera=below_the_lamp())), integrator, 16, [1])
+    rays = integrator.statistics.rays
+    assert rays["camera"] < rays["shadow"] < 9 * rays["camera"]
+
+
+def test_a_pass_traces_each_walk_once() -> None:
+    """What is read while the camera walk waits for its evaluation would evaluate it twice."""
+    scene = mi.load_dict(stage(camera=below_the_lamp(film=film(32, 32))))
+    lanes = 16 * 32 * 32
+    bdpt(8).render(scene, spp=16)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        bdpt(8).render(scene, spp=16, seed=1)
+        kernels = [k for k in dr.kernel_history() if k.get("operation_count", 0) > 500]
+    # Emission, all rounds of the light walk, the camera walk
+    assert len({k["hash"] for k in kernels if k["size"] == lanes}) == 3
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=4.0)))
+    first, second = (batches(scene, bdpt(), 32, [7])[0] for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5 * first.mean())
+
+
+@pytest.mark.parametrize("shape", ["bsplinecurve", "sdfgrid"])
+def test_a_shape_whose_light_paths_cannot_leave_is_named(shape: str, tmp_path) -> None:
+    if shape == "sdfgrid":
+        values = np.linspace(-1, 1, 8, dtype=np.float32).reshape(2, 2, 2, 1)
+        lamp = {"type": shape, "grid": mi.TensorXf(values)}
+    else:
+        (tmp_path / "curve.txt").write_text("".join(f"{i} 0 3 0.1\n" for i in range(5)))
+        lamp = {"type": shape, "filename": str(tmp_path / "curve.txt")}
+    scene = mi.load_dict(stage(light={**lamp, "emitter": {"type": "area"}}))
+    with pytest.raises(NotImplementedError, match='"bdpt": .*give the light to a rectangle'):
+        bdpt().render(scene, spp=1)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_a_light_that_paths_cannot_leave_is_named(variant: str) -> None:
+    beam = rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180),
+                     emitter={"type": "directionalarea"})  # fmt: skip
+    with pytest.raises(NotImplementedError, match='"bdpt": .*directionalarea'):
+        bdpt().render(mi.load_dict(stage(light=beam)), spp=1)

@@ -1,0 +1,317 @@
+"""``composed_prb``: its gradients are those of ``prb`` and of finite differences."""
+
+from __future__ import annotations
+
+import gc
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.util.errors import one_line
+from tests.support.fogs import fog
+from tests.support.stage import area, bitmap, diffuse, rectangle, rgb, stage
+from tests.support.statistical import load
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: Which image gradients the loss has.
+_SHAPE = (12, 16, 3)
+
+
+def make(name: str = "composed_prb", **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": name, "max_depth": 4, **parameters})
+
+
+def room() -> mi.Scene:
+    """Materials, a texture, a rough metal, a lamp and an environment map, all of which have
+    gradients."""
+    pixels = np.random.default_rng(1).uniform(0.2, 0.8, (2, 3, 3))
+    sky = np.random.default_rng(2).uniform(0.5, 1.5, (4, 8, 3))
+    texture = {"type": "bitmap", "bitmap": bitmap(pixels), "raw": True}
+    T = mi.ScalarTransform4f
+    return mi.load_dict(
+        stage(
+            floor=rectangle(T().scale(2), bsdf={"type": "diffuse", "reflectance": texture}),
+            metal={
+                "type": "sphere", "center": [-0.5, 0.2, 0.5], "radius": 0.4,
+                "bsdf": {"type": "roughconductor", "alpha": 0.3,
+                         "specular_reflectance": rgb(0.6, 0.7, 0.8)},
+            },
+            lamp=rectangle(T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180).scale(0.3),
+                           emitter=area(8.0)),
+            sky={"type": "envmap", "bitmap": mi.Bitmap(sky.astype(np.float32))},
+        ),
+        optimize=False,
+    )  # fmt: skip
+
+
+#: A parameter of each kind: the end of its name.
+KINDS = (
+    "floor.bsdf.reflectance.data", "metal.bsdf.alpha.value",
+    "metal.bsdf.specular_reflectance.value", "lamp.emitter.radiance.value", "sky.data",
+)  # fmt: skip
+
+
+def small(scene: mi.Scene) -> mi.SceneParameters:
+    parameters = mi.traverse(scene)
+    for key in parameters.keys():
+        if key.endswith("film.size"):
+            parameters[key] = [_SHAPE[1], _SHAPE[0]]
+    parameters.update()
+    return parameters
+
+
+def loss_weights() -> mi.TensorXf:
+    weights = np.random.default_rng(5).uniform(0.5, 1.5, _SHAPE)
+    return mi.TensorXf(weights.astype(np.float32))
+
+
+def backward(scene, parameters, keys, integrator, seed: int, spp: int) -> list[np.ndarray]:
+    # Copies: the environment map keeps one with another column
+    values = [type(parameters[key])(dr.detach(parameters[key])) for key in keys]
+    for key, value in zip(keys, values):
+        dr.enable_grad(value)
+        parameters[key] = value
+    parameters.update()
+    image = mi.render(
+        scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 500, spp=spp
+    )
+    dr.backward(dr.mean(image * loss_weights(), axis=None))
+    for key in keys:
+        parameters[key] = dr.detach(parameters[key])
+    parameters.update()
+    return [np.array(dr.grad(value)).ravel() for value in values]
+
+
+def keys_of(parameters: mi.SceneParameters) -> list[str]:
+    found = [key for kind in KINDS for key in parameters.keys() if key.endswith(kind)]
+    assert len(found) == len(KINDS), list(parameters.keys())
+    return found
+
+
+@pytest.mark.parametrize("more", [{}, {"hide_emitters": True}], ids=str)
+def test_with_all_defaults_gradients_are_those_of_prb(more: dict[str, Any]) -> None:
+    """They use the same random numbers."""
+    scene = room()
+    parameters = small(scene)
+    keys = keys_of(parameters)
+    ours, theirs = (
+        backward(scene, parameters, keys, make(name, **more), 3, 64)
+        for name in ("composed_prb", "prb")
+    )
+    for key, found, expected in zip(keys, ours, theirs):
+        scale = np.abs(expected).max()
+        assert scale > 0, key
+        np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.005 * scale, err_msg=key)
+
+
+LEARNED = (
+    {"next_event": "contribution", "pilot_spp": 32},
+    {"directions": {"type": "guided_directions", "always_guide": True}, "pilot_spp": 32},
+    {"next_event": "power", "mis": "balance", "connections": 2},
+    {"shadow_test": "visibility_roulette", "roulette": "throughput"},
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "decisions, optimized",
+    [*((decisions, KINDS) for decisions in LEARNED), (LEARNED[0], KINDS[3:4])],
+    ids=lambda each: next(iter(each)),
+)
+def test_decisions_do_not_change_the_expected_gradient(
+    decisions: dict[str, Any], optimized: tuple[str, ...]
+) -> None:
+    scene = room()
+    parameters = small(scene)
+    keys = [key for key in keys_of(parameters) if key.endswith(optimized)]
+    integrator = make(**decisions)
+    ours = [backward(scene, parameters, keys, integrator, seed, 256) for seed in range(12)]
+    prb = make("prb")
+    theirs = [backward(scene, parameters, keys, prb, seed, 512) for seed in range(100, 112)]
+    for index, key in enumerate(keys):
+        found, expected = (
+            np.array([each[index].sum() for each in several]) for several in (ours, theirs)
+        )
+        error = np.sqrt(found.var(ddof=1) / len(found) + expected.var(ddof=1) / len(expected))
+        assert abs(found.mean() - expected.mean()) < 4.5 * error, key
+        precision = 0.3 if "alpha" in key else 0.05
+        assert error < precision * abs(expected.mean()), key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["lamp.emitter.radiance.value", "metal.bsdf.alpha.value"])
+def test_forward_and_backward_mode_agree_with_finite_differences(kind: str) -> None:
+    scene = room()
+    parameters = small(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith(kind))
+    integrator, seeds, spp = make(next_event="contribution"), range(6), 1024
+    start = type(parameters[key])(parameters[key])
+
+    def forward(seed: int) -> float:
+        step = mi.Float(0)
+        dr.enable_grad(step)
+        parameters[key] = start + step
+        parameters.update()
+        image = mi.render(
+            scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 500, spp=spp
+        )
+        dr.forward(step)
+        return float(dr.mean(dr.grad(image) * loss_weights(), axis=None).array[0])
+
+    def loss(value: float, seed: int) -> float:
+        parameters[key] = start + value
+        parameters.update()
+        image = mi.render(scene, integrator=make("path"), seed=seed, spp=spp)
+        return float(dr.mean(image * loss_weights(), axis=None).array[0])
+
+    forwards = [forward(seed) for seed in seeds]
+    parameters[key] = start
+    parameters.update()
+    backwards = [
+        backward(scene, parameters, [key], integrator, seed, spp)[0].sum() for seed in seeds
+    ]
+    h = 0.02
+    differences = [(loss(h, seed) - loss(-h, seed)) / (2 * h) for seed in seeds]
+    expected = np.mean(differences)
+    for found in (forwards, backwards):
+        error = np.hypot(np.std(found, ddof=1), np.std(differences, ddof=1)) / np.sqrt(len(seeds))
+        assert abs(np.mean(found) - expected) < 4.5 * error + 0.01 * abs(expected)
+
+
+def test_what_is_black_has_a_gradient() -> None:
+    """A connection that carries nothing may have a derivative nonetheless."""
+    scene = mi.load_dict(stage(floor=rectangle(mi.ScalarTransform4f().scale(2),
+                                               bsdf=diffuse(0.0))), optimize=False)  # fmt: skip
+    parameters = small(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("floor.bsdf.reflectance.value"))
+    ours, theirs = (
+        backward(scene, parameters, [key], make(name), 3, 64)[0]
+        for name in ("composed_prb", "prb")
+    )
+    assert (theirs > 0).all()
+    np.testing.assert_allclose(ours, theirs, rtol=0.02)
+
+
+def test_the_image_is_that_of_composed_path_and_later_renders_learn_nothing() -> None:
+    scene = load("rooms", width=48, height=27)
+    ours, path = (
+        np.array(make(name, next_event="power").render(scene, spp=8, seed=4))
+        for name in ("composed_prb", "composed_path")
+    )
+    np.testing.assert_allclose(ours, path, rtol=1e-3)
+    integrator = make(next_event="contribution", learn_every=3)
+    integrator.render(scene, spp=32, seed=4)
+    learned, passes = integrator.statistics.learned, integrator.statistics.passes
+    assert learned.startswith("light map: ") and passes > 1
+    for _ in range(2):
+        integrator.render(scene, spp=32, seed=5)
+        assert integrator.statistics.passes == 1 and integrator.statistics.learned == learned
+    integrator.render(scene, spp=32, seed=5)
+    assert integrator.statistics.passes > 1
+    integrator.forget()
+    integrator.render(scene, spp=32, seed=5)
+    assert integrator.statistics.passes > 1
+
+
+def test_where_one_of_several_lights_is_optimized_it_is_chosen_more_often() -> None:
+    """The passes for gradients learn for themselves, once."""
+    T = mi.ScalarTransform4f
+    lamps = {
+        f"lamp{x}": rectangle(
+            T().translate([x - 1.5, 0, 2]).rotate([1, 0, 0], 180).scale(0.2),
+            emitter=area(0.2 if x == 2 else 8.0),
+        )
+        for x in range(4)
+    }
+    scene = mi.load_dict(stage(floor=rectangle(T().scale(2)), **lamps), optimize=False)
+    parameters = small(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("lamp2.emitter.radiance.value"))
+    integrator = make(next_event="contribution", learn_every=8)
+    learned = []
+
+    def gradient(seed: int) -> float:
+        dr.enable_grad(parameters[key])
+        dr.set_grad(parameters[key], 0)
+        image = mi.render(
+            scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 500, spp=64
+        )
+        dr.backward(dr.mean(image, axis=None))
+        learned.append(integrator.gradient_statistics.passes)
+        integrator.gradient_statistics.passes = 0
+        return float(dr.sum(dr.grad(parameters[key]))[0])
+
+    ours = [gradient(seed) for seed in range(16)]
+    assert all(passes > 1 for passes in learned[::8]) and sum(p > 0 for p in learned) == 2
+    integrator = make(next_event="contribution", learn_every=8)
+    for other in parameters.keys():
+        if other.endswith("radiance.value"):
+            dr.enable_grad(parameters[other])
+    # Where all of them are, what is best for the image is used
+    theirs = [gradient(seed) for seed in range(16)]
+    assert not any(learned[16:])
+    assert np.var(ours, ddof=1) < 0.5 * np.var(theirs, ddof=1)
+    assert abs(np.mean(ours) - np.mean(theirs)) < np.std(theirs)
+
+
+def test_gradients_of_another_scene_in_memory_refuse_no_render() -> None:
+    optimized, other = (mi.load_dict(stage(), optimize=False) for _ in range(2))
+    parameters = small(optimized)
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    with pytest.raises(NotImplementedError, match="does not compute gradients"):
+        plain.render(optimized, spp=1)
+    assert plain.render(other, spp=1).numpy().mean() > 0
+
+
+def test_what_has_no_gradients_is_refused() -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    parameters = small(scene)
+    key = next(key for key in parameters.keys() if key.endswith("to_world"))
+    with pytest.raises(RuntimeError) as error:
+        dr.enable_grad(parameters[key].matrix)
+        parameters.update()
+        image = mi.render(scene, parameters, integrator=make(), spp=1)
+        dr.backward(dr.mean(image, axis=None))
+    causes = [one_line(error.value), str(error.value.__cause__)]
+    assert any("which moves things" in text for text in causes), causes
+    with pytest.raises(NotImplementedError, match='use "prbvolpath"'):
+        make().render(mi.load_dict(fog("area")), spp=1)
+    for parameters, message in (
+        ({"next_event": "resampled"}, 'no gradients with the "resampled_lights"'),
+        ({"directions": "swarm"}, "no gradients"),
+        ({"aovs": "d:depth"}, 'no parameter "aovs"'),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            make(**parameters)
+
+
+@pytest.mark.parametrize("with_gradients", [False, True])
+def test_a_scene_with_its_own_renders_again_and_is_freed(with_gradients: bool) -> None:
+    """The integrator held the scene, which holds the integrator: Dr.Jit searched both for arrays
+    without an end, and neither was freed."""
+    learns = {"directions": "guided", "next_event": "contribution", "pilot_spp": 4}
+    described = stage()
+    described["integrator"] = {"type": "composed_prb", "max_depth": 3, **learns}
+    ids = []
+    for _ in range(4):
+        scene = mi.load_dict(described, optimize=False)
+        parameters = mi.traverse(scene)
+        key = next(k for k in parameters.keys() if k.endswith("reflectance.value"))
+        for seed in range(3):
+            if with_gradients:
+                dr.enable_grad(parameters[key])
+                dr.backward(dr.mean(mi.render(scene, parameters, seed=seed, spp=8)))
+                assert np.isfinite(dr.grad(parameters[key]).numpy()).all()
+            else:
+                assert np.isfinite(mi.render(scene, seed=seed, spp=8).numpy()).all()
+        pointer = mi.BSDFPtr(scene.shapes()[0].bsdf())
+        ids.append(int(dr.reinterpret_array(mi.UInt32, pointer)[0]))
+        del scene, parameters, pointer
+        gc.collect()
+    assert len(set(ids)) < len(ids), "the scenes are kept: no BSDF gets the id of one that is gone"

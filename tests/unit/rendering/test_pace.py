@@ -1,0 +1,182 @@
+"""Renders with a timeout plan their pilots for the samples that fit, and passes of all lengths
+share their kernels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.rendering import pace, time_budget
+from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering.stages import EndingSchedule
+from mitsuba_ext.util.arrays import add_own, channel_mean
+from tests.support.stage import area, stage
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _scene(**objects: Any) -> mi.Scene:
+    lamp = {"type": "sphere", "center": [1, -1, 1.5], "radius": 0.2, "emitter": area(3.0)}
+    return mi.load_dict(stage(second=lamp, **objects))
+
+
+def _integrator(name: str, **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": name, "max_depth": 4, **parameters})
+
+
+class _Clock:
+    """A clock that only passes advance: each sample per pixel takes a tenth of a second."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, compiling: float = 0.0) -> None:
+        self.now, self.compiling = 0.0, compiling
+        run_pass = rendering.Job.run_pass
+
+        def run_on_clock(job, stage, spp):
+            run_pass(job, stage, spp)
+            job.statistics.compile_seconds = self.compiling if job.statistics.passes == 1 else 0.0
+            is_new = job.statistics.passes == 1 and self.compiling > 0
+            self.now += 0.1 * spp + (self.compiling if is_new else 0.0)
+            return is_new
+
+        monkeypatch.setattr(rendering.Job, "run_pass", run_on_clock)
+        monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
+
+
+def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
+    clock, asked = _Clock(monkeypatch), []
+    integrator = _integrator("auto_path", timeout=10.0)
+    pilots = integrator.pilots
+
+    def remembered(scene, sensor, spp, *kernels):
+        asked.append(spp)
+        return pilots(scene, sensor, spp, *kernels)
+
+    integrator.pilots = remembered
+    integrator.render(_scene(), spp=5000)
+    assert asked == [5000, 99]
+    assert clock.now == pytest.approx(10, rel=0.05)
+
+
+@pytest.mark.parametrize(("timeout", "compiling"), [(1.0, 0.0), (10.0, 0.5)])
+def test_nothing_is_learned_where_it_would_take_too_long(monkeypatch, timeout, compiling):
+    _Clock(monkeypatch, compiling)
+    integrator = _integrator("auto_path", timeout=timeout)
+    integrator.render(_scene(), spp=5000)
+    assert integrator.statistics.learned == "nothing: the time limit is too short"
+    assert integrator.statistics.spp > 5
+
+
+def test_learning_ends_when_it_has_taken_its_share_of_the_time(monkeypatch):
+    clock = _Clock(monkeypatch)
+    integrator = _integrator("auto_path", timeout=10.0)
+    schedule, passes = integrator.schedule, []
+    run_stage = rendering.Job._run_stage
+
+    def slow(*arguments):
+        made = schedule(*arguments)
+        assert isinstance(made, EndingSchedule)
+        next_stage = made.next_stage
+
+        def delayed():
+            clock.now += 1.0
+            return next_stage()
+
+        made.next_stage = delayed
+        return made
+
+    def run(job, stage, samples, is_last, interrupt):
+        passes.append(is_last)
+        run_stage(job, stage, samples, is_last, interrupt)
+
+    integrator.schedule = slow
+    monkeypatch.setattr(rendering.Job, "_run_stage", run)
+    integrator.render(_scene(), spp=5000)
+    # There would be three or four pilots
+    assert passes == [False, False, True]
+    assert integrator.statistics.learned and not integrator.statistics.interrupted
+
+
+def test_the_samples_that_measure_the_speed_are_part_of_the_image(monkeypatch):
+    _Clock(monkeypatch)
+    scene = _scene()
+    timed = _integrator("auto_path", timeout=20.0).render(scene, spp=5000, seed=3).numpy()
+    path = _integrator("composed_path").render(scene, spp=512, seed=4).numpy()
+    assert timed.mean() == pytest.approx(path.mean(), rel=0.03)
+
+
+def test_without_a_timeout_the_plan_is_that_of_all_samples(monkeypatch):
+    def never(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(pace.time, "perf_counter", lambda: 0.0)
+    integrator = _integrator("auto_path")
+    integrator.pace_stage = never
+    integrator.render(_scene(), spp=16)
+    assert integrator.statistics.spp == 16
+
+
+# ---- Kernels ----
+
+
+def _large_kernels(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Counter[str]:
+    """How often a render launches each of its large kernels."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        integrator.render(scene, spp=spp, seed=1)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    return Counter(k["hash"] for k in kernels if k["operation_count"] > 1000)
+
+
+def test_all_pilots_share_a_kernel():
+    integrator = _integrator("pss_guided", always_guide=True, max_depth=6)
+    # Those of the scout, of three pilots, and of the last stage
+    assert sorted(_large_kernels(_scene(), integrator, 64).values()) == [1, 1, 3]
+
+
+def test_the_light_walk_has_one_kernel():
+    glass = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    kernels = _large_kernels(_scene(glass=glass), _integrator("vcm", max_depth=8), 4)
+    # Two rounds in the pass, and two for the radius
+    assert max(kernels.values()) == 4
+
+
+def test_learning_begins_only_where_there_is_time_to_compile():
+    integrator, scene = _integrator("auto"), _scene()
+    film = {"type": "hdrfilm", "width": 256, "height": 256}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    assert integrator.pilots(scene, sensor, 64, 20) and integrator._has_trial
+    assert integrator.pilots(scene, sensor, 64, 8) and not integrator._has_trial
+    assert not integrator.pilots(scene, sensor, 64, 4)
+
+
+@pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
+def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    scene, compiled = _scene(), []
+    for spp in (32, 64, 48, 80):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            _integrator(name).render(scene, spp=spp, seed=1)
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        new = [k for k in kernels if k["cache_disk"] or not k["cache_hit"]]
+        compiled.append([k["operation_count"] for k in new if k["operation_count"] > 1000])
+    assert not compiled[2] and not compiled[3]
+
+
+def test_the_mean_of_the_channels_is_that_of_dr():
+    colour = mi.Color3f([1, 4], [2, 5], [6, 0])
+    np.testing.assert_allclose(channel_mean(colour).numpy(), [3, 3])
+
+
+def test_lanes_add_to_their_own_places():
+    target = dr.zeros(mi.Float, 4)
+    for _ in range(2):
+        add_own(target, mi.Float(1, 2, 3), mi.UInt32(2, 0, 3), mi.Bool(True, True, False))
+    np.testing.assert_array_equal(target.numpy(), [4, 0, 2, 0])
