@@ -43,7 +43,7 @@ class AdaptiveSampling(WrappingIntegrator):
          available with :monosp:`specfilm`. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
+       - The parameters of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as

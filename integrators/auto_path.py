@@ -26,24 +26,24 @@ class AutoPath(WalkIntegrator):
 
      * - pilot_spp
        - |int|
-       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
-         samples. They count towards the image. With 0, nothing is learned, and the integrator is
-         :monosp:`path`. (Default: 32)
+       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
+         all samples. They count towards the image. With 0, it learns nothing and renders as
+         :monosp:`path` does. (Default: 32)
      * - save_learned, load_learned
        - |string|
-       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
-         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+       - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
      * - keep_learned
        - |bool|
-       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
-         same scene, with the same parameters and film size, then takes no pilot samples, also from
-         another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. (Default: false)
+       - Whether to keep what is learned for later renders of this process (frames, notebooks). A
+         later render of the same scene, with the same parameters and film size, then takes no pilot
+         samples, even from another camera. It learns again if it would take more pilot samples than
+         the earlier render. An image then depends on the renders before it. (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
     more. **Not when** an image has fewer samples (too few to learn from), or when small lamps shine
@@ -61,8 +61,8 @@ class AutoPath(WalkIntegrator):
     :monosp:`integrator.statistics.learned` says which techniques were kept, and why.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`, it takes no
-    pilot samples.
+    :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
+    no pilot samples.
 
     Sources: those of :monosp:`guided_directions`, :monosp:`learned_lights` and
     :monosp:`swarm_path`. The predictions are ours.

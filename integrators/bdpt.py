@@ -56,8 +56,8 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
          :monosp:`path`)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** light travels along paths that camera paths rarely find: caustics of lamps,
     lamps in fittings or near walls, indirect light from hidden lamps. **Not when** :monosp:`path`
@@ -100,10 +100,8 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
     rendered; spectral variants refuse them.
 
     Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
-    :monosp:`composed_path` or :monosp:`volpath`). Gradients
-    are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment` and
-    :monosp:`aov`.
+    :monosp:`composed_path` or :monosp:`volpath`). Gradients are not supported (use :monosp:`prb`);
+    neither are scalar and polarized variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
     chapter 10; D. Cline, PhD thesis, 2007, sections 7.6 and 7.9; I. Georgiev, *Implementing Vertex

@@ -101,20 +101,20 @@ class ComposedPath(WalkIntegrator):
          with guided directions, 4 where only :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
-       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
-         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+       - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
      * - keep_learned
        - |bool|
-       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
-         same scene, with the same parameters and film size, then takes no pilot samples, also from
-         another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. The parameter is accepted only if a
-         decision learns. (Default: false)
+       - Whether to keep what is learned for later renders of this process (frames, notebooks). A
+         later render of the same scene, with the same parameters and film size, then takes no pilot
+         samples, even from another camera. It learns again if it would take more pilot samples than
+         the earlier render. An image then depends on the renders before it. The parameter is
+         accepted only if a decision learns. (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
     or progress, or to combine techniques. **Not when** you need gradients (use

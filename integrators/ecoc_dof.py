@@ -61,7 +61,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          filter as their reconstruction filter. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
+       - The parameters of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as

@@ -90,7 +90,7 @@ class EnergyRedistribution(MetropolisIntegrator):
        - With :monosp:`mutations=path`: as in :class:`mlt`. (Default: true)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
+       - The parameters of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
          max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of independent samples per pixel.

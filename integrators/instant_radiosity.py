@@ -97,8 +97,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - How lights are chosen for direct light; see :class:`composed_path`.
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** diffuse surfaces light each other, in rooms with hidden lamps; or for a preview
     of indirect light: in a second without compensation, or denoised. **Not when** surfaces are

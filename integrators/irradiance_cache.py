@@ -81,8 +81,8 @@ class IrradianceCache(WalkIntegrator):
          they learn, pilot samples are those of :monosp:`path`.
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** surfaces are mostly diffuse, indirect light makes the noise, and a smooth image
     is wanted soon; for an animation of the camera, with :monosp:`cache_file`. **Not when** a

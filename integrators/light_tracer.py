@@ -45,8 +45,8 @@ class LightTracerIntegrator(WalkIntegrator):
          occludes. (Default: uniform)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
     from small lamps, points and spots, or as an independent check of other integrators. **Not
@@ -85,8 +85,8 @@ class LightTracerIntegrator(WalkIntegrator):
     Alpha and output variables are those of the camera rays. Participating media are refused (use
     :monosp:`volpath` or :monosp:`composed_path`), and so are curves whose BSDF transmits light,
     such as :monosp:`hair` (use :class:`bdpt`). Gradients are not supported (use
-    :class:`composed_prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`
-    and :monosp:`aov`.
+    :class:`composed_prb`); neither are scalar and polarized variants, nor nesting in
+    :monosp:`moment` and :monosp:`aov`.
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:

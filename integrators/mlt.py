@@ -67,8 +67,8 @@ class PathMetropolis(ChainIntegrator):
          parts instead of in proportion to their brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
-         hide_emitters, timeout, aovs, checkpoint.
+       - The parameters of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth,
+         rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel. New paths are also used as independent samples.
     Chains sample paths of up to 32 segments; camera samples find longer ones, if ``max_depth``

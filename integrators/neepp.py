@@ -64,21 +64,21 @@ class NEEPlusPlus(WalkIntegrator):
        - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. (Default: 512)
      * - pilot_spp
        - |int|
-       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
-         samples. They count towards the image. With 0, nothing is learned: lights are chosen as by
-         :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots consist
-         of whole passes, and can be longer. (Default: 16)
+       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
+         all samples. They count towards the image. With 0, nothing is learned: lights are chosen as
+         by :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots
+         consist of whole passes, and can be longer. (Default: 16)
      * - save_learned, load_learned
        - |string|
-       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
-         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+       - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
      * - keep_learned
        - |bool|
-       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
-         same scene, with the same parameters and film size, then takes no pilot samples, also from
-         another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. (Default: false)
+       - Whether to keep what is learned for later renders of this process (frames, notebooks). A
+         later render of the same scene, with the same parameters and film size, then takes no pilot
+         samples, even from another camera. It learns again if it would take more pilot samples than
+         the earlier render. An image then depends on the renders before it. (Default: false)
      * - law, slope, floor
        - |several|
        - With :monosp:`rejection`: the law of :monosp:`visibility_roulette`. (Default: affine, 10,
@@ -93,8 +93,8 @@ class NEEPlusPlus(WalkIntegrator):
          of a map to start from. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
@@ -108,8 +108,8 @@ class NEEPlusPlus(WalkIntegrator):
 
     Participating media are rendered as by :monosp:`volpath`; lights are learned for points in them
     as for surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported
-    (use :class:`composed_prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`,
-    it takes no pilot samples.
+    (use :class:`composed_prb`); neither are scalar and polarized variants. Nested in
+    :monosp:`moment`, it takes no pilot samples.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2.

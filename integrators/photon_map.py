@@ -78,8 +78,8 @@ class PhotonMapping(WalkIntegrator):
        - How lights are chosen for direct light; see :class:`composed_path`.
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** a smooth preview is wanted within seconds, of a scene with indirect light and
     caustics. **Not when** the image must be right: :class:`vcm` and :class:`sppm` converge, and

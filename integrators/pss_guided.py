@@ -47,20 +47,20 @@ class PSSGuided(WalkIntegrator):
          (Default: true)
      * - pilot_spp
        - |int|
-       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
-         samples. They count towards the image. With fewer than 3, nothing is guided. With a
+       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
+         all samples. They count towards the image. With fewer than 3, nothing is guided. With a
          stratified sampler, pilots consist of whole passes, and can be longer. (Default: 32)
      * - save_learned, load_learned
        - |string|
-       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
-         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+       - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
      * - keep_learned
        - |bool|
-       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
-         same scene, with the same parameters and film size, then takes no pilot samples, also from
-         another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. (Default: false)
+       - Whether to keep what is learned for later renders of this process (frames, notebooks). A
+         later render of the same scene, with the same parameters and film size, then takes no pilot
+         samples, even from another camera. It learns again if it would take more pilot samples than
+         the earlier render. An image then depends on the renders before it. (Default: false)
      * - always_guide
        - |bool|
        - Guide all :monosp:`bounces`, also where the pilots show that guiding does not pay?
@@ -70,8 +70,8 @@ class PSSGuided(WalkIntegrator):
        - Memory for what is recorded and learned, in MiB. (Default: 512)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** light arrives by way of other surfaces: through doors, windows and gaps, from
     lit corners, along mirrors and glossy things. **Not when** most light is direct (use
@@ -82,7 +82,7 @@ class PSSGuided(WalkIntegrator):
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
     Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
-    tiles only. Gradients are not supported (use :class:`composed_prb`), nor are scalar and
+    tiles only. Gradients are not supported (use :class:`composed_prb`); neither are scalar and
     polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of

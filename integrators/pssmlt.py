@@ -54,7 +54,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
          parts instead of in proportion to their brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
+       - The parameters of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
          max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel.

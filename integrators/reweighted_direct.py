@@ -51,8 +51,8 @@ class ReweightedDirect(WalkIntegrator):
          one. (Default: 0)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
     materials do not need many camera samples. **Not when** most light is indirect (more camera
@@ -60,7 +60,7 @@ class ReweightedDirect(WalkIntegrator):
     :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants.
+    :monosp:`prb`); neither are scalar and polarized variants.
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
     that they are unbiased, are our addition.

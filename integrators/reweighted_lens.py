@@ -22,8 +22,8 @@ class ReweightedLens(ReweightedCamera):
 
      * - (Common parameters)
        - |several|
-       - Those of :class:`ReweightedCamera`: pattern, weights, timeout, checkpoint, and the nested
-         integrator.
+       - The parameters of :class:`ReweightedCamera`: pattern, weights, timeout, checkpoint, and the
+         nested integrator.
 
     **Use it when** the noise comes from defocus: bright or detailed objects far from the focal
     plane. **Not when** it comes from the lighting of these objects, which lens samples do not

@@ -22,7 +22,7 @@ class ReweightedTime(ReweightedCamera):
 
      * - (Common parameters)
        - |several|
-       - Those of :class:`ReweightedCamera`: pattern, weights, timeout, checkpoint.
+       - The parameters of :class:`ReweightedCamera`: pattern, weights, timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as

@@ -29,7 +29,7 @@ class ReweightedWavelength(ReweightedCamera):
          :monosp:`voronoi` (slightly biased). (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`ReweightedCamera`: pattern, timeout, checkpoint.
+       - The parameters of :class:`ReweightedCamera`: pattern, timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as

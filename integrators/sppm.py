@@ -59,8 +59,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
          (Default: 1)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small;
     or in fog: a lamp that shines through glass into fog, beams of light.

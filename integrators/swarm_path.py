@@ -68,23 +68,24 @@ class SwarmPath(WalkIntegrator):
        - Use all maps, also where the pilots show that they do not pay? (Default: false)
      * - pilot_spp
        - |int|
-       - Pilot samples per pixel, from which the integrator learns; at most half of all samples (a
-         quarter, if there are fewer than 8). They count towards the image. With 0, or fewer than 4
-         samples, nothing is learned. (Default: 64)
+       - Number of pilot samples per pixel, from which the integrator learns; at most half of all
+         samples (a quarter, if there are fewer than 8). They count towards the image. With 0, or
+         fewer than 4 samples, nothing is learned. (Default: 64)
      * - save_learned, load_learned
        - |string|
-       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
-         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+       - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
      * - keep_learned
        - |bool|
-       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
-         same scene, with the same parameters and film size, then takes no pilot samples, also from
-         another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. (Default: false)
+       - Whether to keep what is learned for later renders of this process (frames, notebooks). A
+         later render of the same scene, with the same parameters and film size, then takes no pilot
+         samples, even from another camera. It learns again if it would take more pilot samples than
+         the earlier render. An image then depends on the renders before it. (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs.
 
     **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
     nothing else samples well: fast things before a dark background, small lights out of focus,
@@ -118,8 +119,8 @@ class SwarmPath(WalkIntegrator):
     examples/swarm_maps.py).
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`, it takes no
-    pilot samples.
+    :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
+    no pilot samples.
 
     Source: D. Cline, PhD dissertation, BYU 2007, chapter 9 (Tables 9.1 and 9.2). The source keeps
     the maps of two rows of pixels, and averages those of seven neighbours in the order of

@@ -61,8 +61,8 @@ class TwoStage(WalkIntegrator):
        - With visibility maps: as in :class:`composed_path`. (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     **Use it when** you compare methods, or when most noise comes from an uneven map that lights
     rough metal, and the number of camera samples is limited for another reason. **Not when** time
@@ -73,8 +73,7 @@ class TwoStage(WalkIntegrator):
     :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as efficient.
 
     Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
-    are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants.
+    are not supported (use :monosp:`prb`); neither are scalar and polarized variants.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
     Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5).

@@ -43,12 +43,12 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
          α − 1. With 1 it stays. (Default: 0.75)
      * - (Parameters of bdpt)
        - |several|
-       - Those of :class:`bdpt`: light_paths, connections, light_image, subpath_selection,
+       - The parameters of :class:`bdpt`: light_paths, connections, light_image, subpath_selection,
          sample_direct, next_event, directions, roulette, shadow_test.
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         checkpoint.
+       - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
+         aovs, checkpoint.
 
     With :monosp:`light_paths=auto`, the pilot of :class:`bdpt` also decides whether vertices are
     merged.

@@ -24,7 +24,7 @@ class LatinHypercubeSampler(SequenceSampler):
 
      * - (Common parameters)
        - |int|
-       - Those of :class:`SequenceSampler`: sample_count, seed.
+       - The parameters of :class:`SequenceSampler`: sample_count, seed.
 
     **Use it when** you compare sequences. **Not when** you want the least error:
     :monosp:`sobol_owen` stratifies pairs of numbers as well.

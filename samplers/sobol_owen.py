@@ -25,7 +25,7 @@ class SobolSampler(SequenceSampler):
 
      * - (Common parameters)
        - |int|
-       - Those of :class:`SequenceSampler`: sample_count, seed.
+       - The parameters of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
        - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
