@@ -49,9 +49,9 @@ class Auto(LightPathIntegrator):
     --------------------------------------------
 
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
-    guided directions, learned lights, maps of times, points on the lens, wavelengths and distances
-    (:class:`auto_path`); light paths, how many, connections to them, and merging with them
-    (:class:`vcm`); in fog, photons (:class:`sppm`).
+    guided directions, learned lights, and maps of times, lens points, wavelengths and distances
+    (:class:`auto_path`); light paths, their number, the number of connections to them, and merging
+    with them (:class:`vcm`); in fog, photons (:class:`sppm`).
 
     .. pluginparameters::
 
@@ -79,58 +79,59 @@ class Auto(LightPathIntegrator):
     **Use it when** you do not know which technique a scene needs. **Not when** an image has fewer
     than 16 samples per pixel: there is too little to learn from.
 
-    The first two pilots are those of :class:`auto_path`. After these comes a short stage with one
-    light path for each camera path, all techniques, and the lights learned until then. Its samples
-    tell the variance of each choice of techniques (no light paths; 1/16, 1/4, 1 or 4 of them for
-    each camera path; 0, 1, 2 or 4 connections of each vertex of a camera path to their vertices;
-    with merging, and without); numbers of rays tell its time. The best choice is made, if it is
-    better than guided directions and maps. Maps are then left out; guided directions that paid
-    before are learned again, from samples with light paths, unless vertices are merged: they are
-    expected to keep the square root of their efficiency. This stage has 16384 samples, spread over
-    the film, which are not part of the image; in renders of less than a million samples, it has as
-    few as 4096. Where light paths have less than 0.4 of the variance, the samples before are left
-    out of the image.
+    The first two pilots are those of :class:`auto_path`. A short trial follows, with one light path
+    for each camera path, all techniques, and the lights learned so far. Its samples predict the
+    variance of each choice: no light paths, or 1/16, 1/4, 1 or 4 of them per camera path; 0, 1, 2
+    or 4 connections from each vertex of a camera path to their vertices; with or without merging.
+    Counts of rays predict the time of each choice. The integrator uses the best of these choices if
+    it is better than guided directions and maps. Maps are then dropped. Guided directions that paid
+    before are learned again, from samples with light paths, unless vertices are merged; beside
+    light paths, a guide is expected to keep the square root of its efficiency. The trial has 16384
+    samples, spread over the film, which are not part of the image; in renders of less than a
+    million samples, it has as few as 4096. If light paths reduce the variance to less than 0.4 of
+    its value, the samples before the trial are left out of the image.
 
-    With fewer than 262144 samples, it renders as :monosp:`path` does, unless it saves or keeps what
-    it learns: to learn, and to compile the kernels of learning, would take longer than all samples.
-    :monosp:`statistics.learned` then says so. Light paths must gain
-    more, the shorter a render is: 1.1 times the efficiency, and twice that of the rest in renders
-    of half a million samples. With a :monosp:`timeout`, they are tried only where there is time to
-    compile their kernels.
+    With fewer than 262144 samples, the integrator skips learning and renders as :monosp:`path`
+    does, unless it saves or keeps what it learns. Learning, and compiling the kernels that it
+    needs, would take longer than rendering all samples. :monosp:`statistics.learned` then says so.
+    The shorter a render is, the more light paths must gain: 1.1 times the efficiency of everything
+    else that was learned, and twice that efficiency in renders of half a million samples. With a
+    :monosp:`timeout`, light paths are tried only if there is time to compile their kernels.
 
-    The best choice is that with the least expected squared error in a render of this length, times
-    its time. Light that only light paths find counts as missing without them, by its square: in
-    short renders, the noise of light paths can be worse. **A short render may therefore miss light
-    that** :monosp:`path` **misses** (the caustic of a lamp that is a point, for example); a long
-    one finds it. :monosp:`statistics.learned` then says how much of the light is missing, and
-    :monosp:`statistics.effects["light_paths"]` has it as :monosp:`missed`.
+    The best choice has the smallest product of time and expected squared error in a render of this
+    length. For choices without light paths, the squared error includes the square of the light that
+    only light paths find. In a short render, the noise of light paths can be larger than this
+    error. **A short render may therefore miss light that** :monosp:`path` **misses** (for example
+    the caustic of a point light); a long render finds it. :monosp:`statistics.learned` then says
+    how much of the light is missing, and :monosp:`statistics.effects["light_paths"]` contains it as
+    :monosp:`missed`.
 
-    The differences between the passes of the later pilots show the variance that light paths really
-    have. Before the last stage, the integrator goes back to what it had before if that variance,
-    times the predicted time, is more than it would be without light paths, beyond the error of the
-    measurement. (What else is learned is tested in each pilot.)
+    The differences between the passes of the later pilots show the actual variance with light
+    paths. Before the last stage, the integrator returns to its earlier choice if that variance,
+    times the predicted time, exceeds the value without light paths by more than the error of the
+    measurement. (Everything else that is learned is tested in each pilot.)
 
-    In scenes with participating media, there is one choice besides camera paths: photons, as
-    :class:`sppm` renders them. Renders of two million samples or more try them on a coarse film,
-    beside camera paths. The photons also tell how rarely camera paths find the light of lamps in or
-    behind glass, to which they cannot be connected. Where camera paths are kept, the later pilots
-    show what variance they really have, with all that was learned for them. If photons would be
-    better, they render the last stage. A choice of photons is not tested later.
+    In scenes with participating media, photons are the only alternative to camera paths. They are
+    rendered as by :class:`sppm`. Renders of two million samples or more try photons on a coarse
+    film, beside camera paths. The photons also show how rarely camera paths find the light of lamps
+    in or behind glass, to which they cannot be connected. If camera paths are kept, the later
+    pilots show their actual variance, with all that was learned for them. If photons would be
+    better, they render the last stage. Once photons are chosen, this choice is not tested again.
 
-    Light paths are not tried in films of more than two million pixels, and where a light cannot
-    emit them: there, the integrator is :class:`auto_path`. In spectral variants and with moving
+    Light paths are not tried in films of more than two million pixels, nor if a light cannot emit
+    them: the integrator then works as :class:`auto_path`. In spectral variants and with moving
     shapes, nothing is merged, and there are no photons in media.
 
-    Where vertices are merged, or photons are used, the image is slightly blurred, less with each
+    If vertices are merged, or photons are used, the image is slightly blurred, less with each
     sample (:class:`vcm`, :class:`sppm`).
 
     :monosp:`integrator.statistics.learned` says what was chosen, and what it was expected to gain.
     Gradients are not supported (use :class:`composed_prb`); neither are scalar and polarized
     variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
-    Sources: those of :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I. Georgiev,
-    P. Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering
-    Algorithms*, ACM Transactions on Graphics 41(4), 2022.
+    Sources: the sources of :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I.
+    Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional
+    Rendering Algorithms*, ACM Transactions on Graphics 41(4), 2022.
 
     .. tabs::
         .. code-tab:: xml

@@ -17,10 +17,10 @@ class AutoPath(WalkIntegrator):
     Self-configuring path tracer (:monosp:`auto_path`)
     --------------------------------------------------
 
-    A path tracer that chooses its techniques itself. Its first samples test which of them lower the
-    noise of this scene by more than they cost: guided directions, learned lights, and maps of the
-    times, points on the lens, wavelengths and distances in fog with which paths find light. It
-    keeps those that do.
+    A path tracer that chooses its techniques itself: guided directions, learned lights, and maps of
+    the times, lens points, wavelengths and distances in fog with which paths find light. Its first
+    samples test which of them reduce the noise of this scene by more than they cost, and it keeps
+    those.
 
     .. pluginparameters::
 
@@ -45,26 +45,26 @@ class AutoPath(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
-    more. **Not when** an image has fewer samples (too few to learn from), or when small lamps shine
-    through glass (no path from the camera finds their light).
+    **Use it when** you do not know which technique a scene needs, and render 16 or more samples per
+    pixel. **Not when** an image has fewer samples (too few to learn from), or when small lamps
+    shine through glass (camera paths do not find their light).
 
-    It is a :monosp:`composed_path` with :monosp:`directions=guided`,
+    It is :monosp:`composed_path` with :monosp:`directions=guided`,
     :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
     :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; the pages of
     :monosp:`guided_directions`, :monosp:`learned_lights` and :monosp:`swarm_path` describe what is
     learned, and how. The maps are used in scenes with an open shutter, a lens or fog, and in
-    spectral variants; elsewhere they cost nothing. The first two pilots are short: together they
-    predict by how much each technique lowers the variance of the image. A technique that costs more
-    time than it saves is dropped there. The maps of lobes and of directions of :monosp:`swarm_path`
-    are not tried, because guided directions take their place.
+    spectral variants; otherwise they cost nothing. The first two pilots are short. Together they
+    predict how much each technique reduces the variance of the image, and a technique that costs
+    more time than it saves is dropped then. The maps of lobes and of directions of
+    :monosp:`swarm_path` are not tried, because guided directions take their place.
     :monosp:`integrator.statistics.learned` says which techniques were kept, and why.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
     no pilot samples.
 
-    Sources: those of :monosp:`guided_directions`, :monosp:`learned_lights` and
+    Sources: the sources of :monosp:`guided_directions`, :monosp:`learned_lights` and
     :monosp:`swarm_path`. The predictions are ours.
 
     .. tabs::

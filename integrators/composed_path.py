@@ -20,59 +20,58 @@ class ComposedPath(WalkIntegrator):
     ----------------------------------------------
 
     A path tracer whose sampling decisions are chosen in the scene file. Each of its slots holds one
-    decision: a word, or a nested plugin that has parameters of its own. With all defaults it is
-    Mitsuba's :monosp:`path` (with the same random numbers and the same image, as long as one pass
-    of two million samples is enough), but traces no shadow ray for connections that cannot
-    contribute. Where Mitsuba 3.9.1 computes wrong bounds for a scene (it merges rectangles of one
-    material), light of sky and sun leaks through walls in :monosp:`path`, but not here.
+    decision: a word, or a nested plugin with parameters of its own. With all defaults it is
+    Mitsuba's :monosp:`path`, except that it traces no shadow ray for connections that cannot
+    contribute. It uses the same random numbers and gives the same image, as long as one pass of two
+    million samples is enough. When Mitsuba 3.9.1 merges rectangles of one material, it computes
+    wrong bounds for the scene; sky and sun then leak through walls in :monosp:`path`, but not here.
 
     .. pluginparameters::
 
      * - directions
        - |string| or |decision|
-       - Which random numbers choose the direction in which a path goes on: :monosp:`uniform` ones,
+       - Which random numbers choose the next direction of a path: :monosp:`uniform` ones,
          :monosp:`guided` ones, or a nested :monosp:`guided_directions`. With :monosp:`swarm`, maps
          as in :monosp:`swarm_path` choose between reflection and transmission. (Default: uniform)
      * - scattering
        - |string|
-       - What samples the direction in which a path goes on: the :monosp:`bsdf`; or, with
-         :monosp:`swarm`, also learned maps, at the first vertex that is not a mirror (see
-         :monosp:`swarm_path`). (Default: bsdf)
+       - What samples the next direction of a path: the :monosp:`bsdf`; with :monosp:`swarm`, also
+         learned maps, at the first vertex that is not a mirror (see :monosp:`swarm_path`).
+         (Default: bsdf)
      * - next_event
        - |string| or |decision|
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
          (as :monosp:`path` chooses), :monosp:`power` (in proportion to the lights' power),
          :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
-         :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
-         its cost grows with their number), :monosp:`resampled` (one of several candidates) or a
-         nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the environment by
-         the product of BSDF and light) or a nested :monosp:`two_stage_lights`, :monosp:`portals`
-         (directions through the portals of a scene) or a nested :monosp:`portal_lights`. Learned:
-         :monosp:`triple_product` (as :monosp:`two_stage`, and by what is visible),
-         :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
-         (Default: uniform)
+         :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex,
+         at a cost that grows with the number of lights), :monosp:`resampled` (one of several
+         candidates) or a nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the
+         environment by the product of BSDF and light) or a nested :monosp:`two_stage_lights`,
+         :monosp:`portals` (directions through the portals of a scene) or a nested
+         :monosp:`portal_lights`. Learned: :monosp:`triple_product` (as :monosp:`two_stage`,
+         multiplied by the learned visibility), :monosp:`contribution`, :monosp:`visibility`, or a
+         nested :monosp:`learned_lights`. (Default: uniform)
      * - light_numbers
        - |string|
        - Which random numbers choose the light and the point on it, at the first vertex that is
          connected to lights: :monosp:`uniform` ones, or those of learned maps, :monosp:`swarm` (see
-         :monosp:`swarm_path`). It needs a :monosp:`next_event` that does not learn. (Default:
+         :monosp:`swarm_path`). It requires a :monosp:`next_event` that does not learn. (Default:
          uniform)
      * - roulette
        - |string|
        - Which paths Russian roulette continues, from :monosp:`rr_depth` on. :monosp:`throughput` is
-         the rule of :monosp:`path`. With :monosp:`automatic`, where directions are guided by
-         regions of surfaces, the survival probability grows with the radiance that the guide
-         expects the path to find, relative to the brightness of its pixel; elsewhere, and where
-         pilot samples show that this does not pay, the rule is :monosp:`throughput`. (Default:
-         automatic)
+         the rule of :monosp:`path`. With :monosp:`automatic`, and directions guided by regions of
+         surfaces, the survival probability grows with the radiance that the guide expects the path
+         to find, relative to the brightness of its pixel. In all other cases, or if pilot samples
+         show that this does not pay, the rule is :monosp:`throughput`. (Default: automatic)
      * - connections
        - |string|, |int| or |decision|
-       - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
-         number (of points of a :monosp:`hammersley` set), or a nested
+       - How many points on lights the first vertex of a path is connected to: :monosp:`one`, a
+         number (of points from a :monosp:`hammersley` set), or a nested
          :monosp:`weighted_connections`. (Default: one)
      * - mis
        - |string| or |decision|
-       - How connections to lights and BSDF samples that hit them are weighted: :monosp:`power`,
+       - How connections to lights, and BSDF samples that hit lights, are weighted: :monosp:`power`,
          :monosp:`balance`, :monosp:`cutoff`, :monosp:`maximum`, :monosp:`bsdf` or :monosp:`light`
          alone, or a nested :monosp:`mis_heuristic`. (Default: power)
      * - shadow_test
@@ -94,11 +93,12 @@ class ComposedPath(WalkIntegrator):
          :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
-       - Pilot samples per pixel, from which decisions learn; at most a quarter of all samples
-         (half, where only :monosp:`swarm` learns). They count towards the image. The parameter is
-         accepted only if a decision learns. With 0, nothing is learned. With a stratified sampler,
-         pilots consist of whole passes, and can be longer. (Default: 64 with :monosp:`swarm`, 32
-         with guided directions, 4 where only :monosp:`triple_product` learns, otherwise 16)
+       - Number of pilot samples per pixel, from which decisions learn; at most a quarter of all
+         samples (half, if only :monosp:`swarm` learns). They count towards the image. The parameter
+         is accepted only if a decision learns. With 0, nothing is learned. With a stratified
+         sampler, pilots consist of whole passes, and can be longer. (Default: 64 with
+         :monosp:`swarm`, 32 with guided directions, 4 if only :monosp:`triple_product` learns,
+         otherwise 16)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -116,34 +116,34 @@ class ComposedPath(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
-    or progress, or to combine techniques. **Not when** you need gradients (use
+    **Use it when** you want :monosp:`path` with bounded memory, a time budget, statistics or
+    progress, or want to combine techniques. **Not when** you need gradients (use
     :class:`composed_prb`), or a scalar or polarized variant.
 
-    In scenes with participating media, it is :monosp:`volpath`: homogeneous and grid media, all
-    phase functions, index-matched surfaces, cameras and lights in fog. There are three differences:
-    Russian roulette follows the rule of :monosp:`path`; the transmittance of homogeneous media
-    along shadow rays is computed, not estimated, which makes less noise; and
-    :monosp:`hide_emitters` also hides a light that the camera sees through fog. In such scenes,
+    In scenes with participating media, it is :monosp:`volpath`: it supports homogeneous and grid
+    media, all phase functions, index-matched surfaces, and cameras and lights in fog. There are
+    three differences: Russian roulette follows the rule of :monosp:`path`; the transmittance of
+    homogeneous media along shadow rays is computed instead of estimated, which gives less noise;
+    and :monosp:`hide_emitters` also hides a light that the camera sees through fog. In such scenes,
     :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
     :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other choices need a
-    surface and refuse the scene. If the guide of :monosp:`directions` has regions of surfaces,
-    directions are guided at surfaces only; if it has tiles, everywhere. As in :monosp:`volpath`,
-    distances are sampled by the extinction of one colour channel. Where the channels differ much,
-    :monosp:`volpathmis` has less noise; a medium without any extinction in some channels is
+    surface and refuse the scene. A guide for :monosp:`directions` with regions of surfaces guides
+    at surfaces only; a guide with tiles guides everywhere. As in :monosp:`volpath`, distances are
+    sampled from the extinction of one colour channel. If the channels differ widely,
+    :monosp:`volpathmis` has less noise; a medium with no extinction at all in some channels is
     refused. Lights at infinity should not shine into an unbounded medium. With Mitsuba's
-    :monosp:`ldsampler`, images of media have errors of 1 to 2 %, with :monosp:`volpath` too. A
+    :monosp:`ldsampler`, images of media have errors of 1 to 2 %, also with :monosp:`volpath`. A
     medium that exists only inside an :monosp:`instance` is rendered, but plugins that do not
-    support media do not notice it, and so do not refuse the scene.
+    support media do not notice it, and therefore do not refuse the scene.
 
-    A scene file nests a decision as a :monosp:`sampler`, under the name of the slot: to Mitsuba,
-    decisions are samplers. Every decision can be combined with every decision of the other slots,
-    and the image stays unbiased (but for :monosp:`voronoi` weights). All decisions that learn share
-    the same pilot passes: two short ones, which show whether learning pays, and one or two longer
-    ones (a single one, if only :monosp:`visibility_roulette` learns). Together with learned lights,
-    :monosp:`visibility_roulette` uses their map, and does not accept the parameters of a map of its
-    own. :monosp:`neepp`, :monosp:`pss_guided` and :monosp:`reweighted_direct` are this path tracer
-    with some of these decisions preset.
+    A scene file nests a decision as a :monosp:`sampler` with the name of the slot, because to
+    Mitsuba, decisions are samplers. Every decision can be combined with every decision of the other
+    slots, and the image stays unbiased (except with :monosp:`voronoi` weights). All decisions that
+    learn share the same pilot passes: two short ones, which show whether learning pays, and one or
+    two longer ones (only one pass, if only :monosp:`visibility_roulette` learns). When lights are
+    learned, :monosp:`visibility_roulette` uses their map, and does not accept parameters for a map
+    of its own. :monosp:`neepp`, :monosp:`pss_guided` and :monosp:`reweighted_direct` are this path
+    tracer with some of these decisions preset.
 
     Source: the algorithms are those of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T.
     Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple

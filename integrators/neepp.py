@@ -37,36 +37,37 @@ class NEEPlusPlus(WalkIntegrator):
     -----------------------------------------
 
     A path tracer that learns from its first samples which lights reach which surfaces. It samples
-    lights accordingly, also parts of large lights and directions of the sky, and can reject most of
-    the shadow rays that would be blocked. Both are unbiased. It is :monosp:`composed_path` with
-    :monosp:`learned_lights`, and with :monosp:`visibility_roulette` if asked for; their pages say
-    more.
+    lights accordingly, including parts of large lights and directions of the sky, and can reject
+    most of the shadow rays that would be blocked. Both techniques are unbiased. The integrator is
+    :monosp:`composed_path` with :monosp:`learned_lights`, and on request with
+    :monosp:`visibility_roulette`; the pages of these plugins have the details.
 
     .. pluginparameters::
 
      * - light_sampling
        - |string|
-       - How a light is chosen at each vertex, as :monosp:`next_event` of :monosp:`composed_path`.
-         Learned: :monosp:`contribution`, :monosp:`visibility`. Not learned: :monosp:`uniform`,
-         :monosp:`power`, :monosp:`spatial`, :monosp:`linear`. (Default: contribution)
+       - How a light is chosen at each vertex, as with :monosp:`next_event` of
+         :monosp:`composed_path`. Learned: :monosp:`contribution`, :monosp:`visibility`. Not
+         learned: :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`, :monosp:`linear`. (Default:
+         contribution)
      * - rejection
        - |bool|
-       - Reject shadow rays by learned visibility? This saves time if :monosp:`light_sampling` is
-         not learned. If it is, hidden lights are hardly ever chosen, and rejection costs more error
-         than it saves time. (Default: false)
+       - Whether to reject shadow rays by learned visibility. This saves time if
+         :monosp:`light_sampling` is not learned. If it is learned, hidden lights are hardly ever
+         chosen, and rejection increases the error by more than the time it saves. (Default: false)
      * - grid
        - |int|
-       - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
-         where :monosp:`light_sampling` is not learned). (Default: as of :monosp:`learned_lights`,
-         :monosp:`spatial_lights` or :monosp:`visibility_roulette`)
+       - Number of voxels along each axis of the region in which paths scatter (of the scene's
+         bounding box, if :monosp:`light_sampling` is not learned). (Default: as for
+         :monosp:`learned_lights`, :monosp:`spatial_lights` or :monosp:`visibility_roulette`)
      * - max_memory
        - |float|
        - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. (Default: 512)
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With 0, nothing is learned: lights are chosen as
-         by :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots
+         all samples. They count towards the image. With 0, it learns nothing: lights are chosen as
+         in :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots
          consist of whole passes, and can be longer. (Default: 16)
      * - save_learned, load_learned
        - |string|
@@ -85,30 +86,30 @@ class NEEPlusPlus(WalkIntegrator):
          0.1)
      * - refine
        - |int|
-       - With :monosp:`rejection`, and only where light sampling is not learned: random visibility
-         tests of :monosp:`visibility_roulette`. (Default: 16)
+       - With :monosp:`rejection`, and only if light sampling is not learned: the number of random
+         visibility tests of :monosp:`visibility_roulette`. (Default: 16)
      * - save_map, load_map
        - |string|
-       - If :monosp:`light_sampling` is learned: the file to which the map is written, and the file
-         of a map to start from. (Default: none)
+       - If :monosp:`light_sampling` is learned: the file to which the map is saved, and the file
+         from which an initial map is loaded. (Default: none)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
+    **Use it when** there are many lights, when most lights are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
-    when** one small light lights an open scene, or when most noise comes from indirect or glossy
-    light: it then costs the time of learning.
+    when** one small light illuminates an open scene, or when most noise comes from indirect or
+    glossy light: learning then costs time and gains nothing.
 
     A first sample per pixel, which is not added to the film, finds the surfaces and the region in
-    which paths scatter. Each pilot but the first chooses its lights by what the earlier pilots have
-    learned. If they show that the gain is small, learning ends there, unless :monosp:`grid`,
-    :monosp:`rejection` or a file of a map is given.
+    which paths scatter. Each pilot except the first chooses its lights by what the earlier pilots
+    have learned. If these show that the gain is small, learning ends early, unless :monosp:`grid`,
+    :monosp:`rejection` or a map file is given.
 
-    Participating media are rendered as by :monosp:`volpath`; lights are learned for points in them
-    as for surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported
-    (use :class:`composed_prb`); neither are scalar and polarized variants. Nested in
+    Participating media are rendered as by :monosp:`volpath`; lights are learned for points in media
+    as they are for surfaces (:monosp:`light_sampling=linear` refuses media). Gradients are not
+    supported (use :class:`composed_prb`); neither are scalar and polarized variants. Nested in
     :monosp:`moment`, it takes no pilot samples.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for

@@ -19,28 +19,29 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     Vertex connection and merging (:monosp:`vcm`)
     ---------------------------------------------
 
-    Bidirectional path tracing (:class:`bdpt`) and photon mapping in one: light that reaches the
-    surroundings of a vertex of a camera path counts there as well (merging), with MIS weights over
-    all techniques.
+    Combines bidirectional path tracing (:class:`bdpt`) and photon mapping: light that arrives near
+    a vertex of a camera path counts at that vertex as well (merging), with MIS weights over all
+    techniques.
 
     .. pluginparameters::
 
      * - merging
        - |string|
-       - Where vertices are merged: :monosp:`caustics`, where light arrives from a mirror or smooth
-         glass; :monosp:`all`, on all rough surfaces, as in the source; :monosp:`none`, which makes
-         the integrator :class:`bdpt`. (Default: caustics)
+       - Where vertices are merged: with :monosp:`caustics`, only where light arrives from a mirror
+         or smooth glass; with :monosp:`all`, on all rough surfaces, as in the source; with
+         :monosp:`none`, nowhere, which makes the integrator :class:`bdpt`. (Default: caustics)
      * - radius
        - |float|
-       - Radius in which vertices are merged in a first pass of one sample per pixel, in
-         units of the scene. A pass of k samples per pixel has 1/k of the area. 0 stands for one in
-         which a disk holds about eight of the vertices of a pass, where there are any (light paths
-         that are traced before the render measure it); but for at most 8 widths of a pixel at the
-         first sample, which shrink with the samples so far, in passes of any size. (Default: 0)
+       - Radius within which vertices are merged in a first pass of one sample per pixel, in units
+         of the scene. A pass of k samples per pixel uses 1/k of the area. With 0, light paths
+         traced before the render choose the radius, so that a disk contains about eight of the
+         vertices of a pass in places that have any. It is then at most 8 pixel widths at the first
+         sample, and this limit shrinks with the number of samples so far, in passes of any size.
+         (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
-         α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i is the squared radius of the first pass times i
+         to the power of α − 1. With 1, it is constant. (Default: 0.75)
      * - (Parameters of bdpt)
        - |several|
        - The parameters of :class:`bdpt`: light_paths, connections, light_image, subpath_selection,
@@ -50,27 +51,27 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    With :monosp:`light_paths=auto`, the pilot of :class:`bdpt` also decides whether vertices are
-    merged.
+    With :monosp:`light_paths=auto`, the pilot of :class:`bdpt` also decides whether to merge
+    vertices.
 
     **Use it when** caustics are seen through water or glass, or in mirrors: no connection finds
-    these. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time, and
-    adds a little bias.
+    them. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time and adds
+    a little bias.
 
-    Merging is biased with any number of samples: light is blurred over the radius. The bias falls
-    with the squared radius, which shrinks from pass to pass, so that the image converges. Where
-    other techniques have large weights, there is little of it.
+    Merging is biased with any finite number of samples: it blurs light over the radius. The bias
+    falls with the squared radius, which shrinks from pass to pass, so the image converges. The bias
+    is small where other techniques have large weights.
 
-    In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
-    where that of the one before ended.
+    In a render in batches (:monosp:`checkpoint`, or several workers), each batch continues with the
+    radius at which the previous one ended.
 
     In spectral variants, sample k of each pixel has the same wavelengths, and with moving shapes
-    the same time: vertices of other paths cannot be merged. Errors of colour and of motion blur are
-    then alike in all pixels; they fall faster than noise.
+    the same time: otherwise the vertices of other paths could not be merged. Errors of colour and
+    motion blur are then the same in all pixels; they fall faster than noise.
 
-    Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
-    :monosp:`composed_path` or :monosp:`volpath`). So is ``technique_images`` of :class:`bdpt` with
-    merging.
+    Participating media are refused, because the light paths do not scatter in them (use
+    :monosp:`sppm`, :monosp:`composed_path` or :monosp:`volpath`). The parameter
+    ``technique_images`` of :class:`bdpt` is refused with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,
