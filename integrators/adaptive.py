@@ -24,8 +24,8 @@ class AdaptiveSampling(WrappingIntegrator):
     Adaptive sampling (:monosp:`adaptive`)
     --------------------------------------
 
-    Renders with a nested integrator, and takes more samples in the pixels whose error is large. The
-    image is unbiased.
+    Renders with a nested integrator, and takes more samples in pixels with a large error. The image
+    is unbiased.
 
     .. pluginparameters::
 
@@ -39,24 +39,25 @@ class AdaptiveSampling(WrappingIntegrator):
          all samples. (Default: 0)
      * - count_samples
        - |bool|
-       - Add a channel :monosp:`samples` to the image, with the number of samples of each pixel? Not
-         available with :monosp:`specfilm`. (Default: false)
+       - Whether to add a channel :monosp:`samples` to the image, with the number of samples of each
+         pixel. Not available with :monosp:`specfilm`. (Default: false)
      * - (Common parameters)
        - |float|
        - The parameters of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
-         ignored.
+         :monosp:`path`, :monosp:`volpath` or an integrator of this package. Its own
+         :monosp:`timeout` is ignored.
 
     **Use it when** the error of the worst pixels matters, some parts of the image are much noisier
-    than others, and samples there take no longer than elsewhere; or when the render is to end at a
-    :monosp:`threshold`. **Not when** the mean error matters, noise is about the same everywhere,
-    noisy pixels are also the slow ones (objects before an empty background), or a stratified
+    than others, and samples there take no longer than elsewhere; or when the render should stop at
+    a :monosp:`threshold`. **Not when** the mean error matters, noise is about the same everywhere,
+    noisy pixels are also the slow ones (objects in front of an empty background), or a stratified
     sampler does better than independent samples. The page ``docs/results/adaptive.md`` of the
-    sources has figures: in the three scenes measured, at equal time, the 95th percentile of the
-    errors was 0.93 to 1.21 times that of uniform sampling, and the mean error 1.06 to 1.31 times.
+    source tree has figures: in the three scenes measured, at equal time, the 95th percentile of the
+    errors was 0.93 to 1.21 times as large as with uniform sampling, and the mean error 1.06 to 1.31
+    times.
 
     The sensor's number of samples (:monosp:`spp`) is the mean over all pixels. The first pass takes
     the same number of samples in each pixel, and so do the pilot passes of a nested integrator that
@@ -64,37 +65,37 @@ class AdaptiveSampling(WrappingIntegrator):
     relative standard deviation, which is estimated from all earlier passes in the pixel and its
     eight neighbours. The power 4/3 minimises the sum of the fourth powers of the relative errors.
     In each pass, every pixel gets at least an eighth of the mean number of samples. Relative errors
-    are those of relMSE: they are relative to the square root of the pixel's squared brightness plus
-    a hundredth of the squared mean of the image.
+    are defined as in relMSE: relative to the square root of the pixel's squared brightness plus a
+    hundredth of the squared mean of the image.
 
-    **Why it is unbiased.** The mean over samples whose number depends on their values is biased: a
-    pixel whose rare bright path no sample has found yet looks converged, gets few samples and stays
-    dark. Here, each pass has a weight, and adds that weight times the mean of its own samples.
-    Weight and number of samples are decided before the pass. So the expected mean of each pass is
-    right, whatever the earlier passes found, and the weights of all passes add up to one. With a
-    :monosp:`threshold`, the last pass of a pixel is decided before it begins as well: its number of
-    samples follows from the variance estimated from earlier passes. A pixel can thus miss the
-    threshold: if no sample in its neighbourhood has found the bright paths when its last pass is
-    decided, it stays noisier. The weight of the first pass is half its share of the samples,
-    because it gives noisy pixels no more samples than others. A bright spot from an early pass
-    stays in the image, because nothing that a pass has added is removed. The source renders pixels
-    anew if their deviation was far above its estimate, which is biased. Here, estimates contain the
-    pixel's own earlier samples, and there are hardly any such pixels.
+    **Why it is unbiased.** The mean over samples is biased if their number depends on their values:
+    a pixel whose rare bright path no sample has found yet looks converged, gets few samples and
+    stays dark. Here, each pass has a weight, and adds that weight times the mean of its own
+    samples. The weight and the number of samples are decided before the pass. The expected mean of
+    each pass is therefore right, whatever the earlier passes found, and the weights of all passes
+    add up to one. With a :monosp:`threshold`, the last pass of a pixel is also decided before it
+    begins: its number of samples follows from the variance estimated from earlier passes. A pixel
+    can therefore miss the threshold: if no sample in its neighbourhood has found the bright paths
+    when its last pass is decided, it stays noisier. The weight of the first pass is half its share
+    of the samples, because it gives noisy pixels no more samples than others. A bright spot from an
+    early pass stays in the image, because nothing that a pass has added is removed. The source
+    renders a pixel again if its deviation was far above the estimate, which is biased. Here,
+    estimates contain the pixel's own earlier samples, and such pixels hardly occur.
 
     With a reconstruction filter wider than a pixel, samples are scaled such that all parts of the
     image plane have the same density. As always, the film divides by the sum of filter weights,
     which is a random number except with the box filter.
 
-    With a stratified sampler, sets of a quarter of :monosp:`pass_spp` samples are stratified, each
-    by itself. Mitsuba's :monosp:`stratified` is refused: the random numbers of its sets depend on
-    each other, so that images are biased (by up to 12 % in a quarter of an image), with
-    :monosp:`path` too. Use :monosp:`multijitter`.
+    With a stratified sampler, each set of :monosp:`pass_spp` / 4 samples is stratified separately.
+    Mitsuba's :monosp:`stratified` is refused: the random numbers of its sets depend on each other,
+    which biases images (by up to 12 % in a quarter of an image), also with :monosp:`path`. Use
+    :monosp:`multijitter`.
 
-    Integrators that add light to other pixels than that of the camera ray are refused
+    Integrators that add light to pixels other than the pixel of the camera ray are refused
     (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its :monosp:`light_image` is
-    off). So are weighted point sets for camera rays (:monosp:`weighted_numbers`). Nested in
-    :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, without
-    adaptive sampling. Gradients are not supported (use :class:`composed_prb`).
+    off). Weighted point sets for camera rays (:monosp:`weighted_numbers`) are refused as well.
+    Nested in :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator,
+    without adaptive sampling. Gradients are not supported (use :class:`composed_prb`).
 
     Source: D. Cline, PhD thesis, 2007, section 5.5; the parameters have the names of Mitsuba's pull
     request 1731. D. Kirk, J. Arvo, *Unbiased Sampling Techniques for Image Synthesis*, SIGGRAPH

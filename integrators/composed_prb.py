@@ -30,18 +30,19 @@ class ComposedPRB(common.RBIntegrator):
     Gradients of the composed path tracer (:monosp:`composed_prb`)
     --------------------------------------------------------------
 
-    Path replay backpropagation, as Mitsuba's :monosp:`prb`, along the paths of
-    :class:`composed_path`: lights and directions can be learned, so that gradients are less noisy
-    in scenes with many or hidden lights. For :monosp:`mi.render(scene, params, integrator=…)`.
+    Path replay backpropagation, as in Mitsuba's :monosp:`prb`, along the paths of
+    :class:`composed_path`. Lights and directions can be learned, which makes gradients less noisy
+    in scenes with many or hidden lights. For use with :monosp:`mi.render(scene, params,
+    integrator=…)`.
 
     .. pluginparameters::
 
      * - directions
        - |string| or |decision|
-       - As in :class:`composed_path`, but for :monosp:`swarm`. (Default: uniform)
+       - As in :class:`composed_path`, except :monosp:`swarm`. (Default: uniform)
      * - next_event
        - |string| or |decision|
-       - As in :class:`composed_path`, but for :monosp:`resampled`, :monosp:`two_stage` and
+       - As in :class:`composed_path`, except :monosp:`resampled`, :monosp:`two_stage` and
          :monosp:`triple_product`. (Default: uniform)
      * - roulette
        - |string|
@@ -64,9 +65,9 @@ class ComposedPRB(common.RBIntegrator):
        - As in :class:`composed_path`. (Default: none)
      * - learn_every
        - |int|
-       - After so many renders of a scene, the next one learns again, since materials and lights may
-         have changed; 0 to learn once. The parameter is accepted only if a decision learns.
-         (Default: 16)
+       - Number of renders of a scene after which the next one learns again, because materials and
+         lights may have changed; 0 to learn only once. The parameter is accepted only if a decision
+         learns. (Default: 16)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. (Default: -1)
@@ -81,21 +82,22 @@ class ComposedPRB(common.RBIntegrator):
        - Seconds after which a render of the image (not of gradients) ends. (Default: -1, none)
 
     **Use it when** you optimize materials, textures, lights or environment maps. **Not when** you
-    optimize the place or shape of things, or the camera (use :monosp:`prb` or
+    optimize the position or shape of objects, or the camera (use :monosp:`prb` or
     :monosp:`prb_projective`), or a scene with participating media (use :monosp:`prbvolpath`): these
     are refused, and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth
-    glass have no gradients, and those of exactly black colours lack the light that scattered rays
-    would have found.
+    glass have no gradients, and gradients of exactly black colours lack the light that scattered
+    rays would have found.
 
-    The image is that of :class:`composed_path`. Derivatives come from a second trace of the same
-    walk, with the same random numbers: at each vertex, the walk tells what the path has gathered,
-    and the rest of its radiance is known. All densities, MIS weights and learned maps are constant.
-    With all defaults, gradients are those of :monosp:`prb`, from the same random numbers up to
-    :monosp:`rr_depth`.
+    The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
+    walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
+    that the path has gathered so far, so the rest of its radiance is known. All densities, MIS
+    weights and learned maps are treated as constants. With all defaults, gradients are the same as
+    with :monosp:`prb`, from the same random numbers up to :monosp:`rr_depth`.
 
-    The first render of a scene takes pilot samples and learns; later ones use what it has learned,
-    as do the passes for gradients. :monosp:`forget()` makes the next one learn. If some of several
-    lights are optimized, the passes for gradients learn which light is best for their derivatives.
+    The first render of a scene takes pilot samples and learns; later renders, and the passes for
+    gradients, use what it has learned. :monosp:`forget()` makes the next render learn again. If
+    some of several lights are optimized, the passes for gradients learn which light is best for
+    their derivatives.
 
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
     Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021.

@@ -34,17 +34,17 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     Effective circle of confusion (:monosp:`ecoc_dof`)
     --------------------------------------------------
 
-    Renders with a nested integrator from the middle of the lens, and computes depth of field from
-    that image with a filter. It is a biased approximation, which needs a fraction of the samples. A
-    near, blurred object hides a part of the lens from the objects behind its edge, which makes
-    these sharper and shifted; the filter reproduces that.
+    Renders with a nested integrator from the centre of the lens, and computes depth of field from
+    that image with a filter. This biased approximation needs a fraction of the samples. A near,
+    blurred object hides a part of the lens from the objects behind its edge, which makes these
+    objects sharper and shifts them; the filter reproduces this.
 
     .. pluginparameters::
 
      * - aperture_radius, focus_distance
        - |float|
-       - Those of the lens, in units of the scene; 0 for those of the sensor, if that is a
-         :monosp:`thinlens`. (Default: 0)
+       - Aperture radius and focus distance of the lens, in units of the scene; with 0, the sensor's
+         own, if the sensor is a :monosp:`thinlens`. (Default: 0)
      * - filter
        - |string|
        - :monosp:`lens` computes, for each of several points of the lens, which layer hides which.
@@ -52,64 +52,65 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          a smaller and shifted circle of confusion for all others. (Default: lens)
      * - hidden_spp
        - |int|
-       - Samples per pixel for hidden surfaces, and for surfaces outside of the film, where a part
-         of the lens sees them; 0 for half of the image's samples per pixel. (Default: 0)
+       - Samples per pixel for surfaces that are hidden, or outside the film, but seen by a part of
+         the lens; 0 for half of the image's samples per pixel. (Default: 0)
      * - denoise
        - |bool|
-       - Denoise the layers before they are filtered (Open Image Denoise, from the package
-         :monosp:`mitsuba-oidn`), except for pixels that show a light? The layers then have a box
-         filter as their reconstruction filter. (Default: false)
+       - Whether to denoise the layers before they are filtered (with Open Image Denoise, from the
+         package :monosp:`mitsuba-oidn`), except for pixels that show a light. The layers then use a
+         box reconstruction filter. (Default: false)
      * - (Common parameters)
        - |float|
        - The parameters of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
-         ignored.
+         :monosp:`path`, :monosp:`volpath` or an integrator of this package. Its own
+         :monosp:`timeout` is ignored.
 
     **Use it when** you want a preview, an animation or a look, and most noise comes from defocus.
-    **Not when** the image must be correct: use :monosp:`path` with a :monosp:`thinlens`.
-    The page ``docs/results/ecoc_dof.md`` of the sources has figures, and pictures that show where
-    it is wrong.
+    **Not when** the image must be correct: use :monosp:`path` with a :monosp:`thinlens`. The page
+    ``docs/results/ecoc_dof.md`` of the source tree has figures, and pictures that show where it is
+    wrong.
 
-    **Layers.** There are up to five: two before the focus, one in focus, two behind it; fewer where
-    all surfaces are blurred alike. One ray for each pixel determines the limits between them. Each
-    sample of the nested integrator belongs to the layer of the first surface that its ray hits.
-    Around edges, further samples find what this surface hides: their rays begin behind it, where
-    the blur is half as large (behind the focus: halfway to the blur of the sky), and pass through
-    the back of the same shape. Gaps that remain are filled with the colours around them.
-    Neighbouring layers share the surfaces near the limit between them.
+    **Layers.** There are up to five layers: two in front of the focus, one in focus, two behind it;
+    fewer if all surfaces are blurred alike. One ray per pixel determines the boundaries between
+    them. Each sample of the nested integrator belongs to the layer of the first surface that its
+    ray hits. Around edges, further samples find what this surface hides. Their rays begin behind
+    it, where the blur is half as large (behind the focus, halfway to the blur of the sky), and pass
+    through the back of the same shape. Remaining gaps are filled with the colours around them.
+    Neighbouring layers share the surfaces near the boundary between them.
 
     **The filter** :monosp:`lens` looks up each layer, for each pixel and 48 points of the lens, at
-    the position where that point sees it; nearer layers cover those behind them. It uses copies of
-    lower resolution where the blur is large, and fewer points where all circles of confusion are
-    small. Small bright spots, such as a lamp at night, are instead spread over their circle, where
-    nearer layers let their light through. The time of the filter does not depend on the number of
-    samples. With :monosp:`effective` there are three layers. The near one is blurred with one
-    radius, the median of those of its surfaces.
+    the position where that point sees it; nearer layers cover the layers behind them. It uses
+    copies of lower resolution where the blur is large, and fewer points where all circles of
+    confusion are small. Small bright spots, such as a lamp at night, are instead spread over their
+    circle of confusion, where nearer layers let their light through. The time of the filter does
+    not depend on the number of samples. With :monosp:`effective` there are three layers. The near
+    one is blurred with a single radius, the median radius of its surfaces.
 
-    **Where it errs.** Objects seen in mirrors and through glass are blurred as the mirror and the
-    glass are. The layers ignore surfaces that let most light through (:monosp:`mask`,
-    :monosp:`thindielectric`). Of hidden surfaces, only the first is known. Highlights depend on the
-    direction, and are rendered from the middle of the lens only. Limits between layers lie where
-    blurs have a gap; in a hedge there is none. Samples outside of the film reach as far as a
-    quarter of its longer edge; beyond, the filter repeats what is there. Where the image is in
-    focus, the noise of the nested integrator stays.
+    **Where it errs.** Objects seen in mirrors and through glass are blurred as much as the mirror
+    or the glass itself. The layers ignore surfaces that let most light through (:monosp:`mask`,
+    :monosp:`thindielectric`). Only the first hidden surface is known. Highlights depend on the
+    direction, but are rendered from the centre of the lens only. Boundaries between layers lie at
+    gaps in the distribution of blur; a hedge, for example, has no such gap. Samples outside the
+    film extend to a quarter of its longer edge; beyond that, the filter repeats the border. Where
+    the image is in focus, the noise of the nested integrator remains.
 
     The sensor must be a :monosp:`thinlens`, or a :monosp:`perspective` with both parameters given.
-    The film is any but a :monosp:`specfilm`, with any filter and crop window. Output variables
-    (:monosp:`aovs`) are rendered from the middle of the lens, and not blurred. The sensor's samples
-    (:monosp:`spp`) are those of the image; those of ``hidden_spp`` are additional, and are taken
-    after the :monosp:`timeout`. Integrators that add light to other pixels than that of the camera
-    ray are refused (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its
-    :monosp:`light_image` is off). Of our integrators, only :monosp:`variance` can nest it. Nested
-    in :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, not
-    filtered. Gradients are not supported (use :class:`composed_prb`).
+    Any film except :monosp:`specfilm` is accepted, with any filter and crop window. Output
+    variables (:monosp:`aovs`) are rendered from the centre of the lens, and not blurred. The
+    sensor's samples (:monosp:`spp`) are used for the image; the samples of ``hidden_spp`` are
+    additional, and are taken even after the :monosp:`timeout`. Integrators that add light to pixels
+    other than the pixel of the camera ray are refused (:monosp:`light_tracer`, Markov chains, and
+    :monosp:`bdpt` unless its :monosp:`light_image` is off). Of our integrators, only
+    :monosp:`variance` can nest it. Nested in :monosp:`moment` or :monosp:`aov`, it returns the
+    unfiltered samples of its nested integrator. Gradients are not supported (use
+    :class:`composed_prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.1 to 5.5 (:monosp:`effective`). The
     filter :monosp:`lens`, more than three layers and hidden surfaces in them are ours. The source
-    shifts the circle by α times the effective radius. By geometry, the shift is α times the whole
+    shifts the circle by α times the effective radius. Geometrically, the shift is α times the full
     radius, which is what :monosp:`effective` uses.
 
     .. tabs::

@@ -38,8 +38,8 @@ class EnergyRedistribution(MetropolisIntegrator):
     Energy redistribution path tracing (:monosp:`erpt`)
     ---------------------------------------------------
 
-    Takes independent samples, and spreads the excess energy of outliers among them by short Markov
-    chains.
+    Takes independent samples, and distributes the excess energy of the outliers among them by short
+    Markov chains.
 
     .. pluginparameters::
 
@@ -50,26 +50,26 @@ class EnergyRedistribution(MetropolisIntegrator):
          sample is a single path, made by one of the techniques of :class:`bdpt`. (Default: primary)
      * - bidirectional
        - |bool|
-       - Do chains sample the paths of :class:`bdpt`? If not, they sample those of :monosp:`path`. A
-         mutation of :class:`bdpt` takes about three times as long, and finds caustics of small
-         lamps. (Default: false)
+       - Whether chains sample the paths of :class:`bdpt`; if not, they sample the paths of
+         :monosp:`path`. A mutation of :class:`bdpt` takes about three times as long, and finds
+         caustics of small lamps. (Default: false)
      * - outliers
        - |float|
        - A sample is an outlier if it is more than this many times as bright as its part of the
-         image. Its energy beyond that goes to chains; all other energy is added to the film as in
-         plain Monte Carlo. 0 gives all energy to chains, as the original does. (Default: 10; with
-         paths 0)
+         image. Its energy above this limit goes to chains; all other energy is added to the film as
+         in plain Monte Carlo. 0 gives all energy to chains, as the original does. (Default: 10;
+         with paths 0)
      * - mutations_per_pixel
        - |int|
-       - Mutations per pixel if all energy is redistributed. If a share of it is, the number of
-         mutations is that share of this number. 0 stands for ``spp``. (Default: 0)
+       - Number of mutations per pixel if all energy is redistributed. If only a fraction of the
+         energy is, the same fraction of mutations is made. 0 stands for ``spp``. (Default: 0)
      * - chain_length
        - |int|
        - Number of mutations of each chain. (Default: 100)
      * - luminance_samples
        - |int|
-       - Number of independent samples, at least, that first measure the brightness of the image and
-         of its parts. (Default: 100000)
+       - Minimum number of independent samples that first measure the brightness of the image and of
+         its parts. (Default: 100000)
      * - proposal_filter
        - |int|
        - Makes the noise of the chains' light more even, but is **biased**: each pixel is multiplied
@@ -83,8 +83,8 @@ class EnergyRedistribution(MetropolisIntegrator):
          (Default: 0)
      * - bidirectional_mutation
        - |bool|
-       - With :monosp:`mutations=path`: replace a part of the path by a random walk from both sides?
-         (Default: false)
+       - With :monosp:`mutations=path`: whether to replace a part of the path by a random walk from
+         both sides. (Default: false)
      * - lens_perturbation, multi_chain_perturbation, caustic_perturbation
        - |bool|
        - With :monosp:`mutations=path`: as in :class:`mlt`. (Default: true)
@@ -95,14 +95,14 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     ``spp`` is the number of independent samples per pixel.
 
-    **Use it when** an image of :monosp:`path` is fine but for bright spots that need very many
-    samples: caustics that are seen through water or glass, light through a small hole; with
+    **Use it when** an image of :monosp:`path` is fine except for bright spots that need a very
+    large number of samples: caustics seen through water or glass, light through a small hole; with
     ``bidirectional``, when the same holds for :class:`bdpt`. With ``mutations=path``, also for
-    caustics of small lamps, and light through gaps. **Not when** there are no bright spots: it then
-    is :monosp:`path` at a somewhat higher cost.
+    caustics of small lamps, and light through gaps. **Not when** there are no bright spots: it is
+    then :monosp:`path` at a somewhat higher cost.
 
     Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the
-    same energy at each visit. They begin at independent samples, so that there is no start-up bias,
+    same energy at each visit. They begin at independent samples, so there is no start-up bias,
     whatever their length.
 
     With :monosp:`mutations=path`, chains use lens and caustic perturbations. They sample paths of

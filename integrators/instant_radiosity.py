@@ -51,47 +51,47 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     Instant radiosity (:monosp:`instant_radiosity`)
     -----------------------------------------------
 
-    Vertices of a few light paths become virtual point lights, which all pixels share. Camera paths
-    are connected to them where they first meet a surface that is no mirror, and mostly end there.
-    Connections are bounded, and what is cut off is found by BSDF sampling: the image is that of
-    :monosp:`path`.
+    The vertices of a few light paths become virtual point lights, which all pixels share. Camera
+    paths are connected to them at the first surface that is not a mirror, where most of them end.
+    Connections are bounded, and BSDF sampling finds the light that the bound cuts off. The image
+    therefore converges to the image of :monosp:`path`.
 
     .. pluginparameters::
 
      * - light_paths
        - |int|
-       - Number of light paths of a set of virtual lights. (Default: 300)
+       - Number of light paths that form a set of virtual lights. (Default: 300)
      * - interleaving
        - |int|
-       - Neighbouring pixels have different sets, in a pattern of so many pixels in both directions;
-         with 1, all pixels share one. (Default: 1)
+       - Neighbouring pixels use different sets, in a pattern that repeats after this many pixels in
+         both directions; with 1, all pixels share one set. (Default: 1)
      * - connections
        - |int|
-       - To how many virtual lights a vertex is connected. (Default: 1)
+       - How many virtual lights a vertex is connected to. (Default: 1)
      * - choice
        - |string|
        - How virtual lights are chosen: :monosp:`uniform`; :monosp:`power` (by the flux that they
          emit); :monosp:`clustered` (by flux, distance and cosines, with a light tree); or
-         :monosp:`learned` (by flux, and by what pilot samples found to arrive at this place from
-         that region, occlusion included: for long renders). (Default: power)
+         :monosp:`learned` (by flux, and by how much light, occlusion included, pilot samples found
+         to arrive at a place from each region: for long renders). (Default: power)
      * - bound
        - |float|
-       - The largest geometry term that a connection counts with, in units of 1 / (diagonal of the
-         scene)². Larger values are faster, and noisier in corners; 0 makes it :monosp:`path`.
+       - The largest geometry term of a connection, in units of 1 / (diagonal of the scene)². Larger
+         values are faster, but noisier in corners; with 0, the integrator is :monosp:`path`.
          (Default: 5)
      * - compensation
        - |bool|
-       - Is what the bound cuts off found by BSDF sampling? If not, corners are too dark, and the
-         image is biased: for previews. (Default: true)
+       - Whether BSDF sampling finds the light that the bound cuts off. If not, corners are too
+         dark, and the image is biased: for previews. (Default: true)
      * - light_aovs
        - |bool|
-       - Writes the parts of the image, whose sum it is, to the channels :monosp:`direct.R`,
+       - Whether to write the parts that add up to the image to the channels :monosp:`direct.R`,
          :monosp:`virtual.R`, :monosp:`compensation.R`, …, and a picture of the virtual lights to
          :monosp:`lights.R`, …: see below. (Default: false)
      * - pilot_spp, save_learned, load_learned, keep_learned
        - |int|, |string| or |bool|
-       - As in :class:`composed_path`; only with the choice :monosp:`learned`. (Default: 16, none,
-         none, false)
+       - As in :class:`composed_path`; accepted only if :monosp:`choice` is :monosp:`learned`.
+         (Default: 16, none, none, false)
      * - next_event, shadow_test
        - |string| or decision
        - How lights are chosen for direct light; see :class:`composed_path`.
@@ -100,57 +100,57 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** diffuse surfaces light each other, in rooms with hidden lamps; or for a preview
-    of indirect light: in a second without compensation, or denoised. **Not when** surfaces are
-    glossy, caustics matter (:class:`vcm`), or light is mostly direct: it then is :monosp:`path` at
+    **Use it when** diffuse surfaces light each other in rooms with hidden lamps, or for a preview
+    of indirect light: within a second without compensation, or denoised. **Not when** surfaces are
+    glossy, caustics matter (:class:`vcm`), or light is mostly direct: it is then :monosp:`path` at
     a higher price.
 
-    **Direct light** is sampled as by :monosp:`path`, with its MIS weights; the points of lamps are
-    no virtual lights. Virtual lights lie where a BSDF has a part that is not a delta distribution;
-    light paths pass mirrors and clear glass. A camera path is connected at vertices of such
-    surfaces, after any chain of mirrors and glass.
+    **Direct light** is sampled as by :monosp:`path`, with its MIS weights; points on lamps are not
+    virtual lights. Virtual lights lie where a BSDF has a part that is not a delta distribution;
+    light paths pass via mirrors and through clear glass. A camera path is connected at vertices on
+    such surfaces, after any chain of mirrors and glass.
 
-    **The bound.** A connection has the weight min(1, b / K). A camera path that goes on, and meets
-    a surface where a virtual light could be, carries on with the weight max(0, 1 − b / K) for all
-    that leaves this surface by reflection; where that is 0, it ends. On diffuse surfaces, K is the
-    geometry term G. Elsewhere, K = π p cos' / distance² · max(1, π p'), where p is the density of
-    BSDF samples at the camera path's vertex, in the place of its cosine, and p' that at the virtual
-    light, of the direction from which its light comes. Both are large in narrow lobes: connections
-    by way of glossy surfaces hardly count, and the camera path goes on there as at mirrors. No
-    roughness has to be chosen at which this begins. Without compensation, only this glossy part of
-    the difference is still found by camera paths.
+    **The bound.** A connection has the weight min(1, b / K). A camera path that continues to a
+    surface where a virtual light could be has the weight max(0, 1 − b / K) for everything that
+    leaves this surface by reflection; if the weight is 0, the path ends. On diffuse surfaces, K is
+    the geometry term G. Elsewhere, K = π p cos' / distance² · max(1, π p'), where p is the density
+    of BSDF samples at the camera path's vertex (in place of its cosine), and p' is the density, at
+    the virtual light, of the direction from which its light comes. Both densities are large in
+    narrow lobes: connections via glossy surfaces hardly count, and the camera path continues there
+    as at mirrors. No roughness threshold has to be chosen for this. Without compensation, camera
+    paths still find this glossy part of the difference, but nothing else.
 
     **Sets.** A pass takes some samples of each pixel. The first samples of all pixels share one
-    set, the second ones another, and so on; a set has no more light paths than a quarter of the
-    samples that use it, where there are several. With :monosp:`learned`, a sample chooses from all
-    sets of the pass. Several connections of a vertex are spread evenly over the set, in its order
-    or that of the tree. All choices give each virtual light a probability above 0, by which its
-    contribution is divided.
+    set, the second ones another, and so on; if there are several sets, the number of light paths in
+    a set is at most a quarter of the number of samples that use it. With :monosp:`learned`, a
+    sample chooses from all sets of the pass. If a vertex has several connections, they are spread
+    evenly over the set, in its order or in the order of the tree. All choices give each virtual
+    light a probability above 0, and its contribution is divided by this probability.
 
-    **What virtual lights give** is told by :monosp:`light_aovs`: :monosp:`virtual` is the light of
-    connections to them, :monosp:`compensation` what camera paths found with a weight below one, and
-    :monosp:`direct` all that they found with full weight: lamps that are seen, direct light, and
-    what comes by way of mirrors and glass. Where :monosp:`compensation` is noisy, a larger bound
-    helps; where :monosp:`virtual` is, more connections do. In :monosp:`lights`, each virtual light
-    that a :monosp:`perspective` or :monosp:`thinlens` sees is a dot, as bright as the radiance that
-    it sends to the camera; with many samples, the dots become the image of a light tracer.
+    **The contribution of virtual lights** is shown by :monosp:`light_aovs`. The channel
+    :monosp:`virtual` contains the light from connections to them, :monosp:`compensation` the light
+    that camera paths found with a weight below one, and :monosp:`direct` all light that camera
+    paths found with full weight: visible lamps, direct light, and light via mirrors and glass. If
+    :monosp:`compensation` is noisy, a larger bound helps; if :monosp:`virtual` is noisy, more
+    connections help. In :monosp:`lights`, each virtual light that a :monosp:`perspective` or
+    :monosp:`thinlens` sensor sees is a dot, as bright as the radiance that it sends to the camera;
+    with many samples, the dots become the image of a light tracer. ``statistics.learned`` reports
+    the number of virtual lights and the bound, in units of the scene.
 
-    ``statistics.learned`` tells the number of virtual lights and the bound, in units of the scene.
+    **The learned choice** is next event estimation++ over virtual lights. Because these differ in
+    each pass, the integrator learns how much light reaches one region of surfaces from another, for
+    each pair of regions. It then chooses a region by this value and the brightness of the virtual
+    lights there, and one of those by its flux.
 
-    **The learned choice** is next event estimation++ over virtual lights. These are others in each
-    pass; so pairs of regions of surfaces are learned: how much light from the one reaches the
-    other. A region is then chosen by that and by the brightness of the virtual lights that are
-    there, and one of these by flux.
-
-    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps. Virtual spherical
+    Virtual lights on glossy surfaces show as dim, noisy reflections of lamps. Virtual spherical
     lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving
-    shapes and lights, and participating media are refused: camera paths of other wavelengths and
-    times cannot share virtual lights. So are curves whose BSDF transmits light, such as
-    :monosp:`hair`, through which no light paths pass (use :class:`bdpt`). Of lights of the type
-    :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light is
-    rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
-    origin. Gradients are not supported (use :class:`composed_prb`), nor nesting in :monosp:`moment`
-    and :monosp:`aov`.
+    shapes and lights, and participating media are refused, because camera paths of different
+    wavelengths and times cannot share virtual lights. Curves whose BSDF transmits light, such as
+    :monosp:`hair`, are refused, because light paths do not pass through them (use :class:`bdpt`).
+    Lights of type :monosp:`directionalarea`, which :monosp:`path` does not find, contribute
+    indirect light only. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from
+    the origin. Gradients are not supported (use :class:`composed_prb`), and neither is nesting in
+    :monosp:`moment` and :monosp:`aov`.
 
     Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
     the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy

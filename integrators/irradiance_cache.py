@@ -41,80 +41,81 @@ class IrradianceCache(WalkIntegrator):
     Irradiance cache (:monosp:`irradiance_cache`)
     ---------------------------------------------
 
-    Computes the irradiance of indirect light and its gradients at a few places of diffuse surfaces,
-    with many paths each, and interpolates between them. Direct light, and all that is not diffuse,
-    is sampled as by :monosp:`path`.
+    Computes the irradiance of indirect light and its gradients at a few places on diffuse surfaces,
+    from many paths each, and interpolates between these places. Direct light, and everything that
+    is not diffuse, is sampled as by :monosp:`path`.
 
     .. pluginparameters::
 
      * - accuracy
        - |float|
-       - *a* of Eq. 10.9: by how much of itself irradiance may change from a record to a place that
-         uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.4)
+       - *a* of Eq. 10.9: the relative change of irradiance, estimated from distances and normals,
+         that is allowed between a record and a place that uses it. Smaller values give denser
+         records. (Default: 0.4)
      * - min_spacing
        - |float|
-       - The smallest radius in which a record is valid, in widths of a pixel at its place.
-         (Default: 2)
+       - The smallest radius in which a record is valid, in pixel widths at its place. (Default: 2)
      * - max_spacing
        - |float|
-       - The largest one, likewise. (Default: 60)
+       - The largest radius in which a record is valid, in the same units. (Default: 60)
      * - gather_samples
        - |int|
-       - About the number of paths from each record. (Default: 512)
+       - Approximate number of paths from each record. (Default: 512)
      * - effort
        - |float|
-       - The most paths from records, in units of the samples of the image: a render of few samples
-         makes few records, and goes on as :monosp:`path` elsewhere. (Default: 0.5)
+       - Maximum number of paths from all records, divided by the number of samples of the image. A
+         render with few samples makes few records, and continues as :monosp:`path` elsewhere.
+         (Default: 0.5)
      * - max_share
        - |float|
-       - The largest share of a record's irradiance that one path may bring: what exceeds it is cut
-         off. Otherwise rare bright paths (caustics) leave spots, as wide as records are valid. 1
-         cuts nothing off. (Default: 0.1)
+       - The largest share of a record's irradiance that one path may contribute; any excess is cut
+         off. Otherwise rare bright paths (caustics) leave spots as wide as the radius in which
+         records are valid. 1 cuts nothing off. (Default: 0.1)
      * - cache_file
        - |string|
-       - A file in which records are kept. A render reads it if it exists, adds the records that its
-         view needs, and writes it. It serves other cameras in the same scene with the same
-         parameters, such as the frames of an animation. (Default: none)
+       - Name of a file that keeps the records. A render reads it if it exists, adds the records
+         that its view needs, and writes it. Other cameras can use it in the same scene with the
+         same parameters, for example in the frames of an animation. (Default: none)
      * - next_event, shadow_test
        - |string| or decision
        - How lights are chosen; see :class:`composed_path`. The paths from records use them too. If
-         they learn, pilot samples are those of :monosp:`path`.
+         they learn, pilot samples are taken as by :monosp:`path`.
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** surfaces are mostly diffuse, indirect light makes the noise, and a smooth image
-    is wanted soon; for an animation of the camera, with :monosp:`cache_file`. **Not when** a
-    denoiser may be used (denoised :monosp:`path` is nearer to the truth in the same time), the
+    **Use it when** surfaces are mostly diffuse, indirect light causes the noise, and you want a
+    smooth image soon; or for an animation of the camera, with :monosp:`cache_file`. **Not when** a
+    denoiser is an option (denoised :monosp:`path` is closer to the truth in the same time), the
     image must be right, surfaces are glossy, details are as small as pixels everywhere (plants,
-    hair: each needs records), or direct light makes the noise.
+    hair: each detail needs records), or direct light causes the noise.
 
     **How it works.** A *record* is a place with its irradiance, two gradients, and a radius. Camera
-    rays through a coarse grid of pixels, then finer ones, find places that no record covers. Of
-    these, some get a record, none close to another. Paths through the strata of the hemisphere make
-    it (Eqs. 10.6 and 10.7); they are those of :monosp:`path` in full length, and never ask the
-    cache, so that errors do not grow from bounce to bounce. Light that the first segment hits is
-    direct light, and not counted. The radius is the harmonic mean of the distances of what is seen,
-    times the accuracy, or less where the gradient is steep. It is clamped by that of neighbours,
-    and a record that mispredicts a neighbour does not reach it. The image then takes its samples:
-    where a camera path samples a diffuse lobe, the records around tell the indirect light there.
-    Places that no record covers (with enough samples, a thousandth of the pixels, and what is seen
-    in glossy reflections) go on as in :monosp:`path`.
+    rays through a coarse grid of pixels, then finer ones, find places that no record covers. Some
+    of these places get a record, such that no two new records are close to each other. A record is
+    computed from paths through the strata of the hemisphere (Eqs. 10.6 and 10.7). These are paths
+    of :monosp:`path` in full length, and never look up the cache, so errors do not grow from bounce
+    to bounce. Light that the first segment hits is direct light, and not counted. The radius is the
+    harmonic mean of the distances to the visible surfaces, times the accuracy, or less if the
+    gradient is steep. It is clamped by the radii of neighbours, and a record that mispredicts a
+    neighbour does not extend to it. Then the samples of the image are taken: where a camera path
+    samples a diffuse lobe, the indirect light is interpolated from the surrounding records. At
+    places that no record covers (with enough samples, a thousandth of the pixels, and surfaces seen
+    in glossy reflections), paths continue as in :monosp:`path`.
 
-    The image is biased with any number of samples: interpolation errs, and each record has noise
-    that all pixels around it share. The error falls with :monosp:`accuracy` and
-    :monosp:`min_spacing`, and with more :monosp:`gather_samples`. Weights are 1 − ε/a, and not 1/ε
-    as in Eq. 10.9, which shows the noise of records; and records overlap by 1.3 times their radius.
-
-    Caustics are part of the irradiance, with the noise of :monosp:`path`, and blurred: use
-    :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
+    The image is biased with any number of samples: interpolation is inexact, and each record has
+    noise that all pixels around it share. The error falls with :monosp:`accuracy` and
+    :monosp:`min_spacing`, and with more :monosp:`gather_samples`. Weights are 1 − ε/a instead of
+    1/ε as in Eq. 10.9, which would show the noise of records; and records overlap by 1.3 times
+    their radius. Caustics are part of the irradiance, blurred and with the noise of :monosp:`path`:
+    use :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
     mirrors and glass, paths may be longer than :monosp:`max_depth` by the segments before the
     diffuse surface. A :monosp:`timeout` leaves half of the time to the records.
 
-    Spectral variants, moving shapes and participating media are refused: records are shared by all
-    wavelengths and times. Gradients are not supported (use :class:`composed_prb`), nor nesting in
-    :monosp:`moment` and :monosp:`aov`.
+    Spectral variants, moving shapes and participating media are refused, because all wavelengths
+    and times share the records. Gradients are not supported (use :class:`composed_prb`), and
+    neither is nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: G. J. Ward, F. M. Rubinstein, R. D. Clear, *A Ray Tracing Solution for Diffuse
     Interreflection*, SIGGRAPH 1988; G. J. Ward, P. S. Heckbert, *Irradiance Gradients*,

@@ -33,14 +33,14 @@ class LightTracerIntegrator(WalkIntegrator):
     -------------------------------------
 
     Traces paths from the lights and connects each of their vertices to the sensor. It renders the
-    image of :monosp:`path`, except for what it cannot see (below), and finds caustics that
+    same image as :monosp:`path`, except for what it cannot see (below), and finds caustics that
     :monosp:`path` hardly ever finds.
 
     .. pluginparameters::
 
      * - lens_sampling
        - |string|
-       - How a connection to a :monosp:`thinlens` chooses the point of the aperture:
+       - How a connection to a :monosp:`thinlens` chooses the point on the aperture:
          :monosp:`uniform`, or by :monosp:`visibility`, in the parts of the lens that nothing
          occludes. (Default: uniform)
      * - (Common parameters)
@@ -48,41 +48,41 @@ class LightTracerIntegrator(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
-    from small lamps, points and spots, or as an independent check of other integrators. **Not
-    when** mirrors or glass matter in the image, or when most light goes where the camera does not
-    look: a lamp far away, or a sky over a large scene. Scenes far from the origin differ from
-    :monosp:`path` (by up to 8 % in a quarter of the image, in a scene moved by a thousand times its
-    size); the page of :class:`bdpt` tells why.
+    **Use it when** light reaches diffuse surfaces through glass or via mirrors (caustics), above
+    all from small lamps, point and spot lights, or as an independent check of other integrators.
+    **Not when** mirrors or glass matter in the image, or when most light goes where the camera does
+    not look: a lamp far away, or a sky over a large scene. Images of scenes far from the origin
+    differ from :monosp:`path` (by up to 8 % in a quarter of the image, in a scene moved by a
+    thousand times its size); the page of :class:`bdpt` explains why.
 
-    **What it cannot see.** A vertex cannot be connected to the sensor by way of a mirror, or
-    through glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through
-    smooth glass, through a hole of a mask or through a null surface, is black; a warning says so if
-    the scene has such materials. Emitters that the camera sees directly are rendered. So are lights
-    of the type :monosp:`directionalarea`, which :monosp:`path` does not find (spectral variants
-    refuse them).
+    **What it cannot see.** A vertex cannot be connected to the sensor via a mirror, or through
+    glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through smooth
+    glass, through a hole of a mask or through a null surface, is black; a warning says so if the
+    scene has such materials. Emitters that the camera sees directly are rendered. Lights of type
+    :monosp:`directionalarea`, which :monosp:`path` does not find, are also rendered (spectral
+    variants refuse them).
 
-    **Sensors and films.** The sensor must be a :monosp:`perspective` or :monosp:`thinlens`; the
-    film any :monosp:`hdrfilm`, with any filter and crop window, but without
+    **Sensors and films.** The sensor must be a :monosp:`perspective` or :monosp:`thinlens`. The
+    film must be an :monosp:`hdrfilm`, with any filter and crop window, but without
     :monosp:`sample_border`.
 
     **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture
-    are traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) stores
-    from which pieces each part of the scene is visible. Connections prefer these pieces; the
-    expected image stays the same. It helps where objects near the lens, out of focus, hide a part
-    of it; elsewhere, it only costs the time of the maps. If the parallax is too small to be
+    are traced at the start of a render (at most 600 000 rays), and a table (at most 20 MiB) stores
+    the pieces from which each part of the scene is visible. Connections prefer these pieces; the
+    expected image stays the same. This helps if out-of-focus objects near the lens hide a part of
+    it; otherwise, it only costs the time to make the maps. If the parallax is too small to be
     visible, it falls back to :monosp:`uniform`. With a sensor that has no aperture it has no
     effect, and a warning says so.
 
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
-    emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
-    each. Surfaces and sky emit what :monosp:`path` sees, also where Mitsuba's :monosp:`ptracer` is
-    wrong: for turned spheres and environment maps, lights with interpolated normals, textured
-    lights, merged rectangles, normal and bump maps, filters at the film's edges. With the sampler
-    :monosp:`ldsampler`, whose numbers depend on each other, light paths draw independent random
-    numbers instead.
+    emitter of a light path is chosen by power for one half of the paths, and by
+    :monosp:`sampling_weight` for the other half. Surfaces and sky emit what :monosp:`path` sees,
+    also in cases where Mitsuba's :monosp:`ptracer` is wrong: for turned spheres and environment
+    maps, lights with interpolated normals, textured lights, merged rectangles, normal and bump
+    maps, filters at the film's edges. With the sampler :monosp:`ldsampler`, whose numbers depend on
+    each other, light paths draw independent random numbers instead.
 
-    Alpha and output variables are those of the camera rays. Participating media are refused (use
+    Alpha and output variables come from the camera rays. Participating media are refused (use
     :monosp:`volpath` or :monosp:`composed_path`), and so are curves whose BSDF transmits light,
     such as :monosp:`hair` (use :class:`bdpt`). Gradients are not supported (use
     :class:`composed_prb`); neither are scalar and polarized variants, nor nesting in

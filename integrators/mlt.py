@@ -39,44 +39,45 @@ class PathMetropolis(ChainIntegrator):
          (Default: 0.2)
      * - bidirectional_mutation
        - |bool|
-       - Replace a part of the path by a random walk from both sides? (Default: true)
+       - Whether to replace a part of the path by a random walk from both sides. (Default: true)
      * - lens_perturbation
        - |bool|
-       - Perturb the position on the film, and the path up to its first two consecutive vertices
-         that are neither mirrors nor smooth glass? (Default: true)
+       - Whether to perturb the position on the film, and the path up to its first two consecutive
+         vertices that are neither mirrors nor smooth glass. (Default: true)
      * - multi_chain_perturbation
        - |bool|
-       - The same for paths that other surfaces scatter in between? (Default: true)
+       - Whether to do the same for paths that other surfaces scatter in between. (Default: true)
      * - caustic_perturbation
        - |bool|
-       - Perturb the direction in which light leaves its source, or the last diffuse surface before
-         the one that the camera sees? This needs a sensor that light paths can be connected to.
-         (Default: true)
+       - Whether to perturb the direction in which light leaves its source, or the last diffuse
+         surface before the one that the camera sees. This requires a sensor to which light paths
+         can be connected. (Default: true)
      * - luminance_samples
        - |int|
-       - Number of independent paths, at least, that estimate the brightness of the image, and from
-         which chains start. It is a quarter of the number of mutations if that is more; with a time
-         limit, as many as take a fifth of the time. (Default: 100000)
+       - Minimum number of independent paths that estimate the brightness of the image, and from
+         which chains start. A quarter of the number of mutations is used if that is more; with a
+         time limit, as many as fit into a fifth of the time. (Default: 100000)
      * - chains
        - |int|
        - Number of chains, which run in parallel; at most the number of mutations. 0 stands for
          1024, or for more if each of them still makes 1024 mutations. (Default: 0)
      * - two_stage
        - |bool|
-       - First estimate the brightness of parts of the image, and spread mutations evenly over these
-         parts instead of in proportion to their brightness? (Default: false)
+       - Whether to first estimate the brightness of the parts of the image, and then spread
+         mutations evenly over these parts instead of in proportion to their brightness. (Default:
+         false)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth,
          rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
-    ``spp`` is the number of mutations per pixel. New paths are also used as independent samples.
+    ``spp`` is the number of mutations per pixel. New paths also serve as independent samples.
     Chains sample paths of up to 32 segments; camera samples find longer ones, if ``max_depth``
     allows them.
 
-    **Use it when** most light takes paths that random walks rarely find: caustics, also behind
-    glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt` converge
-    well, or when noise must look even (see :class:`pssmlt`).
+    **Use it when** most light takes paths that random walks rarely find: caustics, including
+    caustics behind glass and in mirrors; light through a gap. **Not when** :monosp:`path` or
+    :class:`bdpt` converge well, or when noise must look even (see :class:`pssmlt`).
 
     The statistics contain the acceptance rates. Participating media are refused, and so
     are curves whose BSDF transmits light, such as :monosp:`hair` (use :class:`pssmlt`).

@@ -45,9 +45,9 @@ class PhotonMapping(WalkIntegrator):
     Photon mapping (:monosp:`photon_map`)
     -------------------------------------
 
-    Traces photons once, before the render. Camera paths then end early: what light leaves the
-    second diffuse surface of a path, and what caustics fall on the first one, is estimated from the
-    photons nearby. Direct light is sampled as by :monosp:`path`.
+    Traces photons once, before the render. Camera paths then end early: the light that leaves the
+    second diffuse surface of a path, and the caustics that fall on the first, are estimated from
+    nearby photons. Direct light is sampled as by :monosp:`path`.
 
     .. pluginparameters::
 
@@ -56,23 +56,24 @@ class PhotonMapping(WalkIntegrator):
        - Number of light paths. (Default: 250000)
      * - final_gather
        - |bool|
-       - Is indirect light found by one more segment from the first diffuse surface? If not, the
-         global map is shown there directly: less noise, and blotches. (Default: true)
+       - Whether one more segment from the first diffuse surface finds indirect light. If not, the
+         global map is shown there directly, with less noise, but blotches. (Default: true)
      * - guided
        - |bool|
-       - Do half of the segments of the final gather follow the directions from which photons have
-         come? This takes longer, and seldom pays. (Default: false)
+       - Whether half of the segments of the final gather follow the directions from which photons
+         have come. This takes longer, and seldom pays. (Default: false)
      * - lookup_size
        - |int|
-       - Number of photons that an estimate is to use; it chooses radii that are 0. (Default: 30)
+       - Number of photons that an estimate should use; it determines the radii that are 0.
+         (Default: 30)
      * - global_radius, caustic_radius
        - |float|
-       - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0:
-         one of four that suits the photons around the place)
+       - Radius within which photons of the two maps are looked up, in units of the scene. (Default:
+         0: the most suitable of four radii, by the photons around the place)
      * - photon_aovs
        - |bool|
-       - Writes what the two maps alone tell of the surface that a pixel shows, to the channels
-         :monosp:`global.R`, :monosp:`caustic.R`, … (Default: false)
+       - Whether to write the estimates of the two maps alone, for the surface that a pixel shows,
+         to the channels :monosp:`global.R`, :monosp:`caustic.R`, … (Default: false)
      * - next_event, shadow_test
        - |string| or decision
        - How lights are chosen for direct light; see :class:`composed_path`.
@@ -81,22 +82,24 @@ class PhotonMapping(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** a smooth preview is wanted within seconds, of a scene with indirect light and
+    **Use it when** you want a smooth preview, within seconds, of a scene with indirect light and
     caustics. **Not when** the image must be right: :class:`vcm` and :class:`sppm` converge, and
-    this does not.
+    this integrator does not.
 
     The image is biased with any number of samples: photons are traced once, and light is blurred
-    over the radius, which does not shrink. More photons make the radius smaller. Photons are found
-    within one of four radii, 1, 2, 4 and 8 times what suits dense photons, and not the k nearest: a
-    loop then needs no heap, and estimates adapt as well.
+    over the radius, which does not shrink. More photons make the radius smaller. An estimate uses
+    the photons within one of four radii (1, 2, 4 and 8 times the radius that suits dense photons)
+    instead of the k nearest photons: the loop then needs no heap, and estimates still adapt.
 
     Photons are stored where a BSDF has a diffuse lobe. Glossy surfaces without one (rough metal and
-    glass) scatter camera paths and photons, as mirrors do, so that reflections in them are sharp.
+    glass) scatter camera paths and photons as mirrors do, so reflections in them are not blurred by
+    the photon radius.
 
-    Spectral variants, moving shapes and participating media are refused: photons of other
-    wavelengths and times cannot be merged. So are curves whose BSDF transmits light, such as
-    :monosp:`hair`, through which no photons pass (use :class:`vcm`). Gradients are not supported
-    (use :class:`composed_prb`), nor nesting in :monosp:`moment` and :monosp:`aov`.
+    Spectral variants, moving shapes and participating media are refused, because photons of
+    different wavelengths and times cannot be merged. Curves whose BSDF transmits light, such as
+    :monosp:`hair`, are refused, because photons do not pass through them (use :class:`vcm`).
+    Gradients are not supported (use :class:`composed_prb`), and neither is nesting in
+    :monosp:`moment` and :monosp:`aov`.
 
     Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH
     course, 2004, section 10.5; D. Cline, PhD thesis, 2007, section 7.7.
