@@ -28,39 +28,40 @@ class DispersiveDielectric(mi.BSDF):
 
      * - int_ior
        - |string| or |float|
-       - What is inside: :monosp:`bk7`, :monosp:`bak4`, :monosp:`f2`, :monosp:`sf6`,
-         :monosp:`sf10`, :monosp:`sf11`, :monosp:`n-sf6`, :monosp:`n-sf11`,
-         :monosp:`fused silica`, :monosp:`water`, :monosp:`diamond`, :monosp:`sapphire` (ordinary
-         ray), or a number for an index that is the same at all wavelengths. (Default: bk7)
+       - The material inside: :monosp:`bk7`, :monosp:`bak4`, :monosp:`f2`, :monosp:`sf6`,
+         :monosp:`sf10`, :monosp:`sf11`, :monosp:`n-sf6`, :monosp:`n-sf11`, :monosp:`fused silica`,
+         :monosp:`water`, :monosp:`diamond`, :monosp:`sapphire` (ordinary ray), or a number for an
+         index that is the same at all wavelengths. (Default: bk7)
      * - cauchy
        - |string|
-       - Instead of int_ior: "A, B" or "A, B, C" of the index A + B/λ² + C/λ⁴, λ in µm.
+       - Instead of int_ior: the coefficients "A, B" or "A, B, C" of the index A + B/λ² + C/λ⁴, with
+         λ in µm.
      * - sellmeier
        - |string|
-       - Instead of int_ior: "B1, B2, B3, C1, C2, C3" of the index whose square is
-         1 + Σ Bλ²/(λ² - C), λ in µm, C in µm².
+       - Instead of int_ior: the coefficients "B1, B2, B3, C1, C2, C3" of the index whose square is
+         1 + Σ Bλ²/(λ² - C), with λ in µm and C in µm².
      * - ext_ior
        - |string| or |float|
        - The index outside: a number, or :monosp:`vacuum`, :monosp:`helium`, :monosp:`hydrogen`,
          :monosp:`air`, :monosp:`carbon dioxide`. (Default: air, 1.000277)
      * - specular_reflectance, specular_transmittance
        - |spectrum| or |texture|
-       - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
+       - Factors of reflection and refraction, 0 to 1; leave them at 1 for physical results.
          (Default: 1)
 
     **Use it when** the colours of dispersion should be visible: prisms, gems, lenses, edges of
     thick glass. **Not when** they would not be visible: a refracted path keeps only one of its four
-    wavelengths, which makes coloured noise. The noise is least with a
+    wavelengths, which causes coloured noise. The noise is lowest with a
     :monosp:`reweighted_wavelength` around the integrator.
 
     It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package:
-    Mitsuba's own cannot continue a path with one wavelength only. With them there is a warning, and
-    pixels whose paths hit the glass are infinite or NaN. With a number as int_ior it works
-    everywhere, as :monosp:`dielectric` does. Reflected light keeps all wavelengths. A
+    Mitsuba's own integrators cannot continue a path with a single wavelength. With them there is a
+    warning, and pixels whose paths hit the glass are infinite or NaN. If int_ior is a number, the
+    plugin works everywhere, as :monosp:`dielectric` does. Reflected light keeps all wavelengths. A
     :monosp:`bumpmap` or :monosp:`normalmap` around it must flip invalid normals
-    (flip_invalid_normals, true by default). Indices of catalogues hold for 360 to 830 nm; beyond
-    this range they are those of its nearer end. The medium outside does not disperse, and the one
-    inside does not absorb (tint it by specular_transmittance). Gradients are not supported.
+    (flip_invalid_normals, true by default). Catalogue indices hold for 360 to 830 nm; beyond this
+    range, the index at its nearer end is used. The medium outside does not disperse, and the medium
+    inside does not absorb (tint it with specular_transmittance). Gradients are not supported.
 
     Source: A. Wilkie et al., *Hero Wavelength Spectral Sampling*, 2014. Indices: data sheets of
     Schott; I. H. Malitson 1965 (fused silica); M. Daimon and A. Masumura 2007 (water); F. Peter

@@ -31,8 +31,8 @@ class DispersiveRoughDielectric(mi.BSDF):
 
      * - int_ior, cauchy, sellmeier, ext_ior
        - |several|
-       - Those of :monosp:`dispersive_dielectric`. The index inside and that outside must differ at
-         all wavelengths from 360 to 830 nm. (Default: int_ior bk7, ext_ior air)
+       - As in :monosp:`dispersive_dielectric`. The indices inside and outside must differ at all
+         wavelengths from 360 to 830 nm. (Default: int_ior bk7, ext_ior air)
      * - distribution
        - |string|
        - The distribution of microfacets: :monosp:`beckmann` or :monosp:`ggx`. (Default: beckmann)
@@ -44,19 +44,19 @@ class DispersiveRoughDielectric(mi.BSDF):
        - Instead of alpha: roughness along the tangent and the bitangent.
      * - sample_visible
        - |bool|
-       - Sample only microfacets that are visible, which is less noisy. (Default: true)
+       - Whether to sample only visible microfacets, which is less noisy. (Default: true)
      * - specular_reflectance, specular_transmittance
        - |spectrum| or |texture|
-       - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
+       - Factors of reflection and refraction, 0 to 1; leave them at 1 for physical results.
          (Default: 1)
 
     **Use it when** the colours of frosted glass should be visible. **Not when** it is so rough that
     the colours mix: the noise remains, and :monosp:`roughdielectric` has less.
 
     It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package, as
-    :monosp:`dispersive_dielectric` does; with a number as int_ior it works everywhere. Only single
-    scattering is modelled: as with Mitsuba's, rougher surfaces lose more energy. Gradients are not
-    supported.
+    :monosp:`dispersive_dielectric` does; if int_ior is a number, it works everywhere. Only single
+    scattering is modelled: as with Mitsuba's plugin, rougher surfaces lose more energy. Gradients
+    are not supported.
 
     Source: A. Wilkie et al., *Hero Wavelength Spectral Sampling*, 2014; B. Walter et al.,
     *Microfacet Models for Refraction through Rough Surfaces*, 2007.

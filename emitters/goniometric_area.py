@@ -21,17 +21,16 @@ class GoniometricArea(AreaLuminaire):
     Area light with an angular profile (:monosp:`goniometric_area`)
     ---------------------------------------------------------------
 
-    An area light whose radiance depends on the direction in which it leaves: a power of the cosine
-    with the normal, or the intensities of a photometric file (IES). Each point of the surface has
-    the same profile.
+    An area light whose radiance depends on direction: by a power of the cosine with the normal, or
+    by the intensities of a photometric file (IES). Each point of the surface has the same profile.
 
     .. pluginparameters::
 
      * - radiance
        - |spectrum| or |texture|
-       - What the profile is multiplied by, in W/(m² sr). With an exponent, it is the radiance along
-         the normal; with a file, the largest intensity divided by the area of the light. (Default:
-         1)
+       - Radiance by which the profile is multiplied, in W/(m² sr). With an exponent, it is the
+         radiance along the normal; with a file, the largest intensity divided by the area of the
+         light. (Default: 1)
      * - exponent
        - |float|
        - The radiance is proportional to this power of the cosine, 0 or more. 0 is
@@ -45,15 +44,16 @@ class GoniometricArea(AreaLuminaire):
        - |float|
        - How often the light is chosen, relative to other lights. (Default: 1)
 
-    **Use it when** a luminaire has louvres, lenses or a reflector that need not be modelled. **Not
-    when** the beam is a few degrees wide and the light is large: connections sample all directions
-    in which the light is visible, as with :monosp:`solid_angle_area`, and find most of them dark.
+    **Use it when** a luminaire has louvres, lenses or a reflector that you do not want to model.
+    **Not when** the beam is a few degrees wide and the light is large: connections sample all
+    directions in which the light is visible, as with :monosp:`solid_angle_area`, and most of these
+    are dark.
 
-    All integrators can use it, those of Mitsuba too, and light paths start from it
+    All integrators can use it, including Mitsuba's, and light paths start from it
     (:monosp:`sample_ray` by the profile of an exponent; integrators of this package by the cosine).
     With a file, the radiance in a direction is the intensity divided by the projected area of the
-    light. The projected area is taken to be at least a tenth of the area, so that the radiance
-    stays finite at 90°.
+    light. The projected area is assumed to be at least a tenth of the area, so the radiance stays
+    finite at 90°.
 
     Errors: files that are not photometric; files whose intensities depend on the horizontal angle,
     on shapes other than :monosp:`rectangle` and :monosp:`disk`; shapes that

@@ -19,42 +19,42 @@ class MovingLight(MovingEmitter):
     Moving light (:monosp:`moving_light`)
     -------------------------------------
 
-    Moves the point light, spot or projector that is nested in it, rigidly, while the shutter is
-    open. Each path sees the emitter in its pose at the time of the path.
+    Moves a nested point light, spot light or projector rigidly while the shutter is open. Each path
+    sees the emitter in its pose at the time of the path.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |emitter|
        - The emitter that moves, exactly one: :monosp:`point`, :monosp:`spot` or
-         :monosp:`projector`. It rests in its own pose before the motion.
+         :monosp:`projector`. Before the motion, it rests in its own pose.
      * - pose_0, pose_1, …
        - |transform|
        - Rotations and translations through which the emitter passes. They are applied after its own
-         :monosp:`to_world` or :monosp:`position`. In between, positions of the origin are
-         interpolated linearly, rotations by slerp (the shorter way).
+         :monosp:`to_world` or :monosp:`position`. Between the poses, positions of the origin are
+         interpolated linearly, and rotations by slerp (the shorter way).
      * - time_0, time_1, …
        - |float|
-       - The times of the poses: one for each, in increasing order, in the units of the sensor's
-         :monosp:`shutter_open` and :monosp:`shutter_close`.
+       - The times of the poses, one for each pose, in increasing order, in the units of the
+         sensor's :monosp:`shutter_open` and :monosp:`shutter_close`.
      * - translate, axis, angle, center, begin, end
        - |vector|, |float|
-       - In place of poses: a displacement and a turn at constant speed; see :monosp:`moving`.
+       - In place of poses: a displacement and a rotation at constant speed; see :monosp:`moving`.
 
     **Use it when** such a light moves visibly between the sensor's :monosp:`shutter_open` and
-    :monosp:`shutter_close`, which must be set. Before the motion and after it, the light rests at
-    its two ends. **Not when** the light has a surface: nest a shape with an area light in
+    :monosp:`shutter_close`, which must be set. Before and after the motion, the light rests at its
+    start and end pose. **Not when** the light has a surface: nest a shape with an area light in
     :monosp:`moving`, which moves both.
 
-    All integrators that connect paths to lights can use it, those of Mitsuba too. Those that start
-    paths from lights refuse it: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
-    :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional. Of the choices among lights
-    that use their positions, :monosp:`spatial_lights` uses its positions during each eighth of the
-    shutter interval, and :monosp:`next_event` = :monosp:`linear` the bounds of its whole motion.
-    ``sampling_weight`` is that of the nested emitter, and cannot be changed after loading;
+    All integrators that connect paths to lights can use it, including Mitsuba's. Integrators that
+    start paths from lights refuse it: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
+    :monosp:`erpt` and :monosp:`pssmlt` if they are bidirectional. Two methods choose lights by
+    their positions: :monosp:`spatial_lights` uses its positions during each eighth of the shutter
+    interval, and :monosp:`next_event` = :monosp:`linear` uses the bounds of its whole motion.
+    ``sampling_weight`` is taken from the nested emitter, and cannot be changed after loading;
     :monosp:`mi.traverse` shows its other parameters under their usual names.
 
-    Errors: other emitters are refused, and so are poses with scales.
+    Errors: other emitters are refused, and so are poses that scale.
 
     Source: R. L. Cook, T. Porter, L. Carpenter, *Distributed Ray Tracing*, 1984; K. Shoemake,
     *Animating Rotation with Quaternion Curves*, 1985 (slerp).

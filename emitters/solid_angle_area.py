@@ -16,9 +16,9 @@ class SolidAngleArea(AreaLuminaire):
     Area light, sampled by solid angle (:monosp:`solid_angle_area`)
     ---------------------------------------------------------------
 
-    An area light that emits as Mitsuba's :monosp:`area`, in its place on a shape, but is sampled
-    differently: a connection samples a direction in the solid angle of the light, as seen from the
-    point that is lit, and not a point on its surface.
+    An area light for a shape, which emits like Mitsuba's :monosp:`area`, but is sampled
+    differently: a connection samples a direction in the solid angle that the light subtends at the
+    illuminated point, instead of a point on the light's surface.
 
     .. pluginparameters::
 
@@ -27,48 +27,49 @@ class SolidAngleArea(AreaLuminaire):
        - Emitted radiance, in W/(m² sr). (Default: 1)
      * - sampling
        - |string|
-       - Directions are sampled by :monosp:`solid_angle`, or by :monosp:`projected` solid angle:
-         also by the cosine with the normal of the surface that is lit (rectangles only). (Default:
-         solid_angle)
+       - Directions are sampled by :monosp:`solid_angle`, or by :monosp:`projected` solid angle,
+         which includes the cosine with the normal of the illuminated surface (rectangles only).
+         (Default: solid_angle)
      * - sampling_weight
        - |float|
        - How often the light is chosen, relative to other lights. (Default: 1)
 
-    **Use it when** a light is large or close, as seen from what it lights: a panel over a table, a
-    strip along a wall. **Not when** its texture has a small bright part (:monosp:`area` samples the
-    texture; here only directions are sampled), or when the integrator learns from parts of lights:
-    :monosp:`neepp`, :monosp:`two_stage_lights`, :monosp:`learned_lights` and
-    :monosp:`resampled_lights` divide lights of the type :monosp:`area`, but not this one; nor for
+    **Use it when** a light is large, or close to the objects it illuminates: a panel over a table,
+    a strip along a wall. **Not when** its texture has a small bright part (:monosp:`area` samples
+    the texture; this emitter samples directions only), or when the integrator learns from parts of
+    lights: :monosp:`neepp`, :monosp:`two_stage_lights`, :monosp:`learned_lights` and
+    :monosp:`resampled_lights` divide lights of type :monosp:`area`, but not of this type; nor for
     hundreds of small lights: each adds about 3 ms to every pass.
 
-    All integrators can use it, those of Mitsuba too, and light paths start from it.
+    All integrators can use it, including Mitsuba's, and light paths start from it.
 
-    - :monosp:`rectangle`, also sheared ones, and meshes of up to 16 triangles: directions are
-      uniformly distributed. A mesh chooses among the triangles that face the point, in proportion
-      to their solid angles; where its triangles hide each other, samples are lost.
-    - :monosp:`disk`: uniform up to a factor between 1 and 1.21. A disk that to_world makes an
-      ellipse, and meshes of more triangles, are sampled by area, as :monosp:`area` does.
-    - :monosp:`sphere`: uniformly in its cone, as :monosp:`area` does; by area if the sphere shines
+    - :monosp:`rectangle` (also sheared), and meshes of up to 16 triangles: directions are uniformly
+      distributed. A mesh chooses among the triangles that face the point, in proportion to their
+      solid angles; samples are lost if its triangles hide each other.
+    - :monosp:`disk`: uniform up to a factor between 1 and 1.21. A disk that to_world turns into an
+      ellipse, and meshes of more triangles, are sampled by area, as with :monosp:`area`.
+    - :monosp:`sphere`: uniformly in its cone, as with :monosp:`area`; by area if the sphere shines
       inwards and the point is inside.
 
-    The same density holds for MIS in each of these cases. So the weight of a sample is at most 1.21
-    times the radiance times the solid angle (where directions are sampled).
+    In each of these cases, MIS uses the same density. If directions are sampled, the weight of a
+    sample is therefore at most 1.21 times the radiance times the solid angle.
 
-    :monosp:`projected` makes less noise than :monosp:`solid_angle` on surfaces that are not smooth,
-    most of all where the light stands at right angles to them, but a sample takes longer; do not
-    use it for distant lights. The part of the light above the horizon of the surface, and the part
-    below it (emitters do not know from which side the surface is seen), are sampled in proportion
-    to the absolute cosine with its geometric normal. A tenth of the samples are those of
-    :monosp:`solid_angle`, so that weights are at most ten times as large as there, also where
-    shading normals or transmission let light in that the cosine does not expect. For lights whose
-    projected solid angle is less than 1e-3, and for points in media, :monosp:`solid_angle` is used.
+    :monosp:`projected` gives less noise than :monosp:`solid_angle` on surfaces that are not smooth,
+    above all on surfaces at right angles to the light, but a sample takes longer; do not use it for
+    distant lights. The part of the light above the horizon of the surface, and the part below it
+    (emitters do not know from which side the surface is seen), are sampled in proportion to the
+    absolute cosine with its geometric normal. A tenth of the samples are taken by
+    :monosp:`solid_angle`. Weights are therefore at most ten times as large as with
+    :monosp:`solid_angle`, even where shading normals or transmission let in light for which the
+    cosine does not account. For lights whose projected solid angle is less than 1e-3, and for
+    points in media, :monosp:`solid_angle` is used.
 
     On meshes with interpolated normals, light leaves on the side of the interpolated normal, as
-    rays see it; densities do not depend on these normals. Gradients reach the radiance, but not the
-    shape.
+    rays see it; densities do not depend on these normals. Gradients propagate to the radiance, but
+    not to the shape.
 
-    Errors: other shapes are refused in the first render, and so is :monosp:`projected` on other
-    shapes than :monosp:`rectangle`.
+    Errors: other shapes are refused in the first render, and so is :monosp:`projected` on shapes
+    other than :monosp:`rectangle`.
 
     Source: J. Arvo in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44,
     sections 4.3 and 4.4; C. Peters, *BRDF Importance Sampling for Polygonal Lights*, ACM TOG 40(4),

@@ -134,8 +134,10 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     :monosp:`compensation` is noisy, a larger bound helps; if :monosp:`virtual` is noisy, more
     connections help. In :monosp:`lights`, each virtual light that a :monosp:`perspective` or
     :monosp:`thinlens` sensor sees is a dot, as bright as the radiance that it sends to the camera;
-    with many samples, the dots become the image of a light tracer. ``statistics.learned`` reports
-    the number of virtual lights and the bound, in units of the scene.
+    with many samples, the dots become the image of a light tracer.
+
+    ``statistics.learned`` reports the number of virtual lights and the bound, in units of the
+    scene.
 
     **The learned choice** is next event estimation++ over virtual lights. Because these differ in
     each pass, the integrator learns how much light reaches one region of surfaces from another, for

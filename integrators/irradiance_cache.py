@@ -108,8 +108,10 @@ class IrradianceCache(WalkIntegrator):
     noise that all pixels around it share. The error falls with :monosp:`accuracy` and
     :monosp:`min_spacing`, and with more :monosp:`gather_samples`. Weights are 1 − ε/a instead of
     1/ε as in Eq. 10.9, which would show the noise of records; and records overlap by 1.3 times
-    their radius. Caustics are part of the irradiance, blurred and with the noise of :monosp:`path`:
-    use :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
+    their radius.
+
+    Caustics are part of the irradiance, blurred and with the noise of :monosp:`path`: use
+    :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
     mirrors and glass, paths may be longer than :monosp:`max_depth` by the segments before the
     diffuse surface. A :monosp:`timeout` leaves half of the time to the records.
 

@@ -60,7 +60,7 @@ class PathMetropolis(ChainIntegrator):
      * - chains
        - |int|
        - Number of chains, which run in parallel; at most the number of mutations. 0 stands for
-         1024, or for more if each of them still makes 1024 mutations. (Default: 0)
+         1024, or more if each of them still makes 1024 mutations. (Default: 0)
      * - two_stage
        - |bool|
        - Whether to first estimate the brightness of the parts of the image, and then spread

@@ -92,8 +92,7 @@ class PhotonMapping(WalkIntegrator):
     instead of the k nearest photons: the loop then needs no heap, and estimates still adapt.
 
     Photons are stored where a BSDF has a diffuse lobe. Glossy surfaces without one (rough metal and
-    glass) scatter camera paths and photons as mirrors do, so reflections in them are not blurred by
-    the photon radius.
+    glass) scatter camera paths and photons as mirrors do, so reflections in them stay sharp.
 
     Spectral variants, moving shapes and participating media are refused, because photons of
     different wavelengths and times cannot be merged. Curves whose BSDF transmits light, such as

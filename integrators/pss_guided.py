@@ -22,7 +22,7 @@ class PSSGuided(WalkIntegrator):
     Path guiding in primary sample space (:monosp:`pss_guided`)
     -----------------------------------------------------------
 
-    A path tracer that learns from its first samples which random numbers make the BSDF sample
+    A path tracer that learns from its first samples which random numbers lead the BSDF to sample
     directions from which light comes, and draws these numbers more often. It is unbiased, needs no
     knowledge of materials and lights, and guides all BSDFs in the same way. It is
     :monosp:`composed_path` with :monosp:`guided_directions`, whose page says how it learns.
@@ -38,13 +38,13 @@ class PSSGuided(WalkIntegrator):
        - Edge of a tile in pixels; accepted only with :monosp:`tiles`. (Default: 16)
      * - bounces
        - |int|
-       - How many directions of a path are guided, at most. Later bounces that are not worth the
-         time are not guided. (Default: 6; 2 with tiles)
+       - Maximum number of directions of a path that are guided. Later bounces that are not worth
+         the time are not guided. (Default: 6; 2 with tiles)
      * - nee_first_bounce
        - |bool|
-       - Connect the first vertex of a path to lights? False is the setting of the measurements in
-         the thesis, for comparisons; point lights and parallel light are connected to anyway.
-         (Default: true)
+       - Whether to connect the first vertex of a path to lights. False is the setting of the
+         measurements in the thesis, for comparisons; point lights and parallel light are connected
+         to in any case. (Default: true)
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
@@ -63,7 +63,7 @@ class PSSGuided(WalkIntegrator):
          the earlier render. An image then depends on the renders before it. (Default: false)
      * - always_guide
        - |bool|
-       - Guide all :monosp:`bounces`, also where the pilots show that guiding does not pay?
+       - Whether to guide all :monosp:`bounces`, even if the pilots show that guiding does not pay.
          (Default: false)
      * - max_memory
        - |float|
@@ -73,10 +73,10 @@ class PSSGuided(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** light arrives by way of other surfaces: through doors, windows and gaps, from
-    lit corners, along mirrors and glossy things. **Not when** most light is direct (use
-    :monosp:`neepp` to choose among many lights), when an image has fewer than 16 samples per pixel,
-    or for caustics of small lights seen through glass, which paths from the camera do not find.
+    **Use it when** light arrives indirectly: through doors, windows and gaps, from lit corners, via
+    mirrors and glossy objects. **Not when** most light is direct (use :monosp:`neepp` to choose
+    among many lights), when an image has fewer than 16 samples per pixel, or for caustics of small
+    lights seen through glass, which camera paths do not find.
 
     After a render, :monosp:`integrator.statistics.learned` describes what was learned, and
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
@@ -86,7 +86,7 @@ class PSSGuided(WalkIntegrator):
     polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
-    film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
+    film tiles. The regions of surfaces, the estimates, and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

@@ -28,30 +28,31 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
      * - bidirectional
        - |bool|
-       - Do chains sample the paths of :class:`bdpt`? If not, they sample those of :monosp:`path`. A
-         mutation of :class:`bdpt` takes about three times as long, and finds caustics of small
-         lamps. (Default: true)
+       - Whether chains sample the paths of :class:`bdpt`; if not, they sample the paths of
+         :monosp:`path`. A mutation of :class:`bdpt` takes about three times as long, and finds
+         caustics of small lamps. (Default: true)
      * - p_large
        - |float|
        - The probability of a large step, which draws all random numbers anew. (Default: 0.3)
      * - luminance_samples
        - |int|
-       - Number of independent samples, at least, that estimate the brightness of the image, and
-         from which chains start. It is a quarter of the number of mutations if that is more; with a
-         time limit, as many as take a fifth of the time. (Default: 100000)
+       - Minimum number of independent samples that estimate the brightness of the image, and from
+         which chains start. A quarter of the number of mutations is used if that is more; with a
+         time limit, as many as fit into a fifth of the time. (Default: 100000)
      * - kelemen_style_weights
        - |bool|
-       - Use large steps also as independent samples, weighted by the balance heuristic? This
-         reduces the noise of dark pixels. (Default: true)
+       - Whether large steps also serve as independent samples, weighted by the balance heuristic.
+         This reduces the noise of dark pixels. (Default: true)
      * - chains
        - |int|
        - Number of chains, which run in parallel; at most the number of mutations. 0 stands for
-         1024, or for more if each of them still makes 1024 mutations (with light paths for 65536,
-         or for more if each still makes 64). (Default: 0)
+         1024, or more if each of them still makes 1024 mutations (with light paths, 65536, or more
+         if each still makes 64 mutations). (Default: 0)
      * - two_stage
        - |bool|
-       - First estimate the brightness of parts of the image, and spread mutations evenly over these
-         parts instead of in proportion to their brightness? (Default: false)
+       - Whether to first estimate the brightness of the parts of the image, and then spread
+         mutations evenly over these parts instead of in proportion to their brightness. (Default:
+         false)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
@@ -62,8 +63,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     **Use it when** light takes paths that are rarely sampled, but whose neighbouring paths carry
     light too: caustics of lamps that are not too small, light through a gap. **Not when**
     :monosp:`path` converges well, or when noise must look even: neighbouring pixels depend on each
-    other, and a chain that has found a rare bright path stays there for long, which shows as a
-    spot. Only renders with different seeds show the true error (see :class:`variance`).
+    other, and a chain that has found a rare bright path stays there for a long time, which shows as
+    a spot. Only renders with different seeds show the true error (see :class:`variance`).
 
     The statistics contain the acceptance rates. Participating media are refused.
 

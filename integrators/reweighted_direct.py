@@ -20,17 +20,18 @@ class ReweightedDirect(WalkIntegrator):
     ------------------------------------------------------
 
     A path tracer that connects the first vertex of each path to many points on lights. The points
-    come from well distributed point sets. Each connection can be weighted by the Voronoi cell of
-    its point. Later vertices of a path are connected to one point each, as by :monosp:`path`. It is
-    :monosp:`composed_path` with :monosp:`weighted_connections`, whose page says more.
+    come from well distributed point sets, and each connection can be weighted by the Voronoi cell
+    of its point. Later vertices of a path are connected to one point each, as in :monosp:`path`. It
+    is :monosp:`composed_path` with :monosp:`weighted_connections`, whose page has the details.
 
     .. pluginparameters::
 
      * - light_samples
        - |int|
-       - Points of a set, which is the number of connections of the first vertex; at most 4096 (1024
-         with :monosp:`poisson_disk`), because beyond that, more camera samples are a better use of
-         the time. With 0, the first vertex finds light by BSDF samples only. (Default: 256)
+       - Number of points in a set, which is the number of connections of the first vertex; at most
+         4096 (1024 with :monosp:`poisson_disk`), because beyond that, more camera samples are a
+         better use of the time. With 0, the first vertex finds light by BSDF samples only.
+         (Default: 256)
      * - vertices
        - |string|
        - Which vertices have this many connections: the :monosp:`first`, or :monosp:`all`. (Default:
@@ -47,7 +48,7 @@ class ReweightedDirect(WalkIntegrator):
      * - camera_samples
        - |int|
        - Samples per pixel of a render without :monosp:`spp`; 0 for the number of the sensor's
-         sampler, which is 4 by default. It has no effect where this integrator is nested in another
+         sampler, which is 4 by default. It has no effect if this integrator is nested in another
          one. (Default: 0)
      * - (Common parameters)
        - |several|
@@ -62,8 +63,8 @@ class ReweightedDirect(WalkIntegrator):
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`); neither are scalar and polarized variants.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
-    that they are unbiased, are our addition.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, which are
+    unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

@@ -30,13 +30,13 @@ class ReweightedLens(ReweightedCamera):
     improve. For a sensor without an aperture (such as :monosp:`perspective`), the nested integrator
     renders as usual, with a warning.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
-    a sample come from the sensor's sampler. A nested integrator of this package learns as usual;
-    its own timeout is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted.
-    Gradients are not supported (use :class:`composed_prb`).
+    The page of :monosp:`weighted_numbers` describes the sets and weights in detail. The other
+    dimensions of a sample come from the sensor's sampler. A nested integrator of this package
+    learns as usual; its own timeout is ignored. If it is nested in :monosp:`moment`, nothing is
+    reweighted. Gradients are not supported (use :class:`composed_prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, and the fact
-    that they are unbiased, are our addition.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, which are
+    unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

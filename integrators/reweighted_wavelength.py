@@ -33,21 +33,21 @@ class ReweightedWavelength(ReweightedCamera):
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`path`, :monosp:`volpath` or one of ours. Only integrators of this package render
-         dispersion (:monosp:`dispersive_dielectric`).
+         :monosp:`path`, :monosp:`volpath` or one of this package. Only integrators of this package
+         render dispersion (:monosp:`dispersive_dielectric`).
 
     **Use it when** the noise is coloured: dispersive glass, lamps and filters with narrow spectra.
     **Not when** it comes from lighting, or from the choice between reflection and refraction in
     glass. RGB and monochrome variants have no wavelengths, and raise an error.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
-    a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
-    :monosp:`reweighted_time`. A nested integrator of this package learns as usual; its own timeout
-    is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted. Gradients are not
-    supported (use :class:`composed_prb`).
+    The page of :monosp:`weighted_numbers` describes the sets and weights in detail. The other
+    dimensions of a sample come from the sensor's sampler, or from a nested
+    :monosp:`reweighted_lens` or :monosp:`reweighted_time`. A nested integrator of this package
+    learns as usual; its own timeout is ignored. If it is nested in :monosp:`moment`, nothing is
+    reweighted. Gradients are not supported (use :class:`composed_prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2. Periodic cells, the fact that
-    they are unbiased, and cells modulo 1/4 are our addition.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2. Periodic cells, which are
+    unbiased, and cells modulo 1/4 are our additions.
 
     .. tabs::
         .. code-tab:: xml

@@ -29,65 +29,65 @@ class ProgressivePhotonMapping(WalkIntegrator):
     Stochastic progressive photon mapping (:monosp:`sppm`)
     ------------------------------------------------------
 
-    Traces photons from the lights in each pass. It estimates the light that leaves the first rough
-    surface of each camera path from the photons around it, and so the light that participating
-    media scatter on the way there. The radius shrinks from pass to pass, so that the image
-    converges.
+    Traces photons from the lights in each pass. From nearby photons, it estimates the light that
+    leaves the first rough surface of each camera path, and the light that participating media
+    scatter on the way there. The radius shrinks from pass to pass, so the image converges.
 
     .. pluginparameters::
 
      * - radius
        - |float|
-       - Radius in which photons are looked for in a first pass of one sample per pixel, in
-         units of the scene. A pass of k samples per pixel has 1/k of the area (except where all
-         samples of a pixel see one point, as with a :monosp:`radiancemeter`). 0 stands for one in
-         which a disk holds about eight of the vertices of a pass, where there are any (light paths
-         that are traced before the render measure it); but for at most 8 widths of a pixel at the
-         first sample, which shrink with the samples so far, in passes of any size. (Default: 0)
+       - Radius within which photons are looked up in a first pass of one sample per pixel, in units
+         of the scene. A pass of k samples per pixel uses 1/k of the area (unless all samples of a
+         pixel see the same point, as with a :monosp:`radiancemeter`). With 0, light paths traced
+         before the render choose the radius, so that a disk contains about eight of the vertices of
+         a pass in places that have any. It is then at most 8 pixel widths at the first sample, and
+         this limit shrinks with the number of samples so far, in passes of any size. (Default: 0)
      * - radius_in_media
        - |float|
-       - As ``radius``, for photons in participating media, which are looked for in a ball: a pass
-         of k samples per pixel has 1/k of the volume. 0 stands for one in which half of the balls
-         hold about eight photons or more. (Default: 0)
+       - As ``radius``, for photons in participating media, which are looked up in a ball: a pass of
+         k samples per pixel uses 1/k of the volume. 0 stands for a radius with which half of the
+         balls contain about eight photons or more. (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is that of the first times
-         i to the power of α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is the squared radius (or
+         cube) of the first pass times i to the power of α − 1. With 1, it is constant. (Default:
+         0.75)
      * - light_paths
        - |float|
-       - Number of light paths for each camera path. More of them make the radius of a pass smaller.
+       - Number of light paths per camera path. More light paths make the radius of a pass smaller.
          (Default: 1)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs, checkpoint.
 
-    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small;
-    or in fog: a lamp that shines through glass into fog, beams of light.
-    **Not when** the scene is large and well lit: each surface needs photons of its own. The
-    integrator :class:`vcm` has all other techniques beside this one.
+    **Use it when** caustics of lamps of any size are seen through water or glass, or in mirrors; or
+    in fog, for a lamp that shines through glass, or beams of light. **Not when** the scene is large
+    and well lit: each surface needs photons of its own. The integrator :class:`vcm` combines this
+    technique with all others.
 
-    The image is biased with any number of samples: light is blurred over the radius, dark at edges
-    and in creases that are narrower than that. The bias falls with the squared radius. Vertices
-    merge only on surfaces that face about the same way, so that light does not leak through thin
-    walls.
+    The image is biased with any number of samples: light is blurred over the radius, and edges and
+    creases narrower than the radius are too dark. The bias falls with the squared radius. Vertices
+    merge only on surfaces that face in about the same direction, so light does not leak through
+    thin walls.
 
-    In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
-    where that of the one before ended.
+    In a render in batches (:monosp:`checkpoint`, or several workers), each batch continues with the
+    radius at which the previous one ended.
 
     In spectral variants, sample k of each pixel has the same wavelengths, and with moving shapes
-    the same time: photons of others cannot be merged. Errors of colour and of motion blur are then
-    alike in all pixels; they fall faster than noise.
+    the same time: otherwise photons could not be merged. Errors of colour and motion blur are then
+    the same in all pixels; they fall faster than noise.
 
-    Participating media are rendered, homogeneous and grid media. Light is blurred over the ball:
-    dark at the surface of a fog, and bright behind a wall that is thinner than the radius. The
-    medium in which a light lies is that on its side of the closest boundary, in the direction of
-    each photon; outside of all boundaries, that behind the last one that a ray from the sensor
+    Homogeneous and grid media are rendered. Light is blurred over the ball: it is too dark at the
+    surface of a fog, and too bright behind a wall that is thinner than the radius. A light is taken
+    to lie in the medium on its side of the closest boundary, in the direction of each photon;
+    outside all boundaries, in the medium behind the last boundary that a ray from the sensor
     crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
 
-    Curves whose BSDF transmits light, such as :monosp:`hair`, are refused: photons do not pass
-    through them (use :class:`vcm`). Gradients are not supported (use :class:`composed_prb`), nor
-    nesting in :monosp:`moment` and :monosp:`aov`.
+    Curves whose BSDF transmits light, such as :monosp:`hair`, are refused, because photons do not
+    pass through them (use :class:`vcm`). Gradients are not supported (use :class:`composed_prb`),
+    and neither is nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
     Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic

@@ -27,45 +27,47 @@ class SwarmPath(WalkIntegrator):
     Sample swarming (:monosp:`swarm_path`)
     --------------------------------------
 
-    A path tracer in which neighbouring pixels share which random numbers found light. For each kind
-    of sampling decision, every tile of the film has a map: a table of probabilities over the random
-    numbers of this decision, learned from the samples of the image itself. It is unbiased, and uses
-    only maps that lower the variance by enough to be worth their time. It is
+    A path tracer in which neighbouring pixels tell each other which random numbers found light. For
+    each kind of sampling decision, every tile of the film has a map: a table of probabilities over
+    the random numbers of this decision, learned from the samples of the image itself. It is
+    unbiased, and uses only maps that reduce the variance by enough to be worth their time. It is
     :monosp:`composed_path` with the word :monosp:`swarm` in several slots.
 
     .. pluginparameters::
 
      * - time_map
        - |bool|
-       - Learn at which times of the shutter interval paths find light? (Default: true)
+       - Whether to learn at which times of the shutter interval paths find light. (Default: true)
      * - lens_map
        - |bool|
-       - Learn through which parts of the aperture paths find light? (Default: true)
+       - Whether to learn through which parts of the aperture paths find light. (Default: true)
      * - wavelength_map
        - |bool|
-       - Learn at which wavelengths paths find light? This has an effect in spectral variants only.
-         (Default: true)
+       - Whether to learn at which wavelengths paths find light. This has an effect in spectral
+         variants only. (Default: true)
      * - distance_map
        - |bool|
-       - Learn at which distances in a homogeneous medium camera rays find light? (Default: true)
+       - Whether to learn at which distances in a homogeneous medium camera rays find light.
+         (Default: true)
      * - light_map
        - |bool|
-       - Learn which light, and which point on it, to sample for the first connection of a path?
-         (Default: true)
+       - Whether to learn which light, and which point on it, to sample for the first connection of
+         a path. (Default: true)
      * - lobe_map
        - |bool|
-       - Learn whether to sample reflection or transmission, at the first eight bounces? A fifth of
-         the paths draws uniform numbers at all bounces, and paths are weighted by the balance
-         heuristic, so that no path weighs more than five times as much as without maps. (Default:
+       - Whether to learn the choice between reflection and transmission at the first eight bounces.
+         A fifth of the paths draw uniform numbers at all bounces, and paths are weighted by the
+         balance heuristic, so no path has more than five times its weight without maps. (Default:
          true)
      * - direction_map
        - |bool|
-       - Learn from which directions light arrives at the first vertex that is not a mirror? Half of
-         its directions are chosen by the map. Off by default: it pays where light comes from a
-         small bright patch (scenes/bounce_card.xml), and seldom elsewhere. (Default: false)
+       - Whether to learn from which directions light arrives at the first vertex that is not a
+         mirror. Half of its directions are chosen by the map. Off by default: it pays when light
+         comes from a small bright patch (scenes/bounce_card.xml), and seldom otherwise. (Default:
+         false)
      * - always_use
        - |bool|
-       - Use all maps, also where the pilots show that they do not pay? (Default: false)
+       - Whether to use all maps, even if the pilots show that they do not pay. (Default: false)
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most half of all
@@ -87,35 +89,36 @@ class SwarmPath(WalkIntegrator):
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
          aovs.
 
-    **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
-    nothing else samples well: fast things before a dark background, small lights out of focus,
-    lamps with spectral lines, beams in fog (their light that is scattered once), dozens of lights
-    that shine on different places, reflections in panes of glass. **Not when** the noise is that of
-    many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
+    **Use it when** most noise comes from a decision for which neighbouring pixels have the same
+    best choice, and that nothing else samples well: fast objects in front of a dark background,
+    small lights out of focus, lamps with spectral lines, beams in fog (single scattering), dozens
+    of lights that shine on different places, reflections in panes of glass. **Not when** the noise
+    comes from many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples
+    per pixel.
 
-    The first pilot has one sample per pixel, and each later pilot as many as all earlier ones
-    together. If the render has few samples, the first pilot is divided into parts: each part of the
-    pixels is as large as all earlier parts together, and uses the maps that these have learned.
-    With a stratified sampler, it is not divided. Samples have weights that are fixed before the
-    render. Samples of the first pilots, whose maps are poor, have smaller weights, but only so much
-    smaller that the variance is at most 1.5 % higher where no map helps.
+    The first pilot has one sample per pixel, and each later pilot has as many as all earlier pilots
+    together. If the render has few samples, the first pilot is divided into parts: each part
+    contains as many pixels as all earlier parts together, and uses the maps learned from them. With
+    a stratified sampler, it is not divided. Samples have weights that are fixed before the render.
+    Samples of the first pilots, whose maps are poor, have smaller weights. The weights are chosen
+    such that the variance is at most 1.5 % higher if no map helps.
 
     The edge of a tile is the smallest power of two with which the tile has at least 64 pilot
-    samples, and at least one for each cell of its maps: 4 pixels for a map of 64 times and 8 for
-    one of 32 x 32 points of the aperture, at 16 and 32 samples per pixel. Until all pilot samples
-    are taken, tiles are up to twice as large. Distances have maps of 128 cells. The maps of one
-    decision have 8 million cells at most, which take 96 MiB, and some hundreds of MiB more while
-    they are estimated. Lights and points on them have one joint map, of 2048 cells at most. The
-    choice of a lobe has maps of 32 cells for each bounce, and for none, one, and more reflections
-    before it. Maps of directions, over height and angle around the z axis, are combined with the
-    BSDF by multiple importance sampling. The estimate of a tile is drawn towards the estimate of
-    the larger tiles around it, as far as chance explains their difference; where little is known,
-    the density is wider. The samples of each pilot tell which density would have been best (in
-    proportion to the mean contribution of a cell, with 5 % of uniform numbers, or to its square
-    root, with 20 %), and by how much it lowers the variance. A map that lowers it by less than 10 %
-    is not used, and is dropped after 4 samples per pixel. After a render,
-    :monosp:`integrator.statistics.learned` describes what was learned, and
-    :monosp:`mitsuba_ext.techniques.swarming.pixel_maps` has the maps of a pixel as arrays (see
+    samples, and at least one for each cell of its maps: 4 pixels for a map of 64 times, and 8
+    pixels for a map of 32 x 32 points of the aperture, at 16 and 32 samples per pixel. Until all
+    pilot samples are taken, tiles are up to twice as large. Distances have maps of 128 cells. The
+    maps of one decision have at most 8 million cells, which take 96 MiB, and some hundreds of MiB
+    more while they are estimated. Lights and points on them have one joint map, of at most 2048
+    cells. The choice of a lobe has maps of 32 cells for each bounce, and separate ones for zero,
+    one, and more reflections before it. Maps of directions, over height and angle around the z
+    axis, are combined with the BSDF by multiple importance sampling. The estimate of a tile is
+    drawn towards the estimate of the larger tiles around it, to the degree that chance explains
+    their difference; if little is known, the density is wider. The samples of each pilot show which
+    density would have been best (proportional to the mean contribution of a cell, with 5 % of
+    uniform numbers, or to its square root, with 20 %), and by how much it reduces the variance. A
+    map that reduces the variance by less than 10 % is not used, and is dropped after 4 samples per
+    pixel. After a render, :monosp:`integrator.statistics.learned` describes what was learned, and
+    :monosp:`mitsuba_ext.techniques.swarming.pixel_maps` returns the maps of a pixel as arrays (see
     examples/swarm_maps.py).
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
@@ -123,9 +126,9 @@ class SwarmPath(WalkIntegrator):
     no pilot samples.
 
     Source: D. Cline, PhD dissertation, BYU 2007, chapter 9 (Tables 9.1 and 9.2). The source keeps
-    the maps of two rows of pixels, and averages those of seven neighbours in the order of
+    the maps of two rows of pixels, and averages the maps of seven neighbours in the order of
     rendering. Passes and tiles, which learn from neighbours on all sides, the estimate, and the
-    measurement of the gain are ours; so are maps of wavelengths, which the source proposes.
+    measurement of the gain are ours. Maps of wavelengths, which the source proposes, are also ours.
 
     .. tabs::
         .. code-tab:: xml

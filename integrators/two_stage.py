@@ -23,19 +23,19 @@ class TwoStage(WalkIntegrator):
 
     A path tracer that connects the first vertex of each path to several directions of the
     environment. It samples them in proportion to an estimate of the product of environment map and
-    BSDF. It is :monosp:`composed_path` with :monosp:`two_stage_lights`, whose page says more, and
-    :monosp:`weighted_connections`.
+    BSDF. It is :monosp:`composed_path` with :monosp:`two_stage_lights`, whose page has the details,
+    and :monosp:`weighted_connections`.
 
     .. pluginparameters::
 
      * - light_samples
        - |int|
-       - Connections of the first vertex, at most 1024. They share one partition of the map.
-         (Default: 16)
+       - Number of connections of the first vertex, at most 1024. They share one partition of the
+         map. (Default: 16)
      * - splits
        - |int|
-       - How often a vertex divides rectangles of the map, at most, in addition to the first
-         division into eight rectangles. (Default: 16)
+       - Maximum number of times that a vertex divides rectangles of the map, in addition to the
+         first division into eight rectangles. (Default: 16)
      * - vertices
        - |string|
        - Which vertices divide the map and have this many connections: the :monosp:`first`, or
@@ -47,12 +47,12 @@ class TwoStage(WalkIntegrator):
          (:monosp:`primary`) or over directions (:monosp:`world`). (Default: unknown)
      * - reallocated
        - |float|
-       - With visibility maps: the share of the connections that are sampled by them, 0 to 0.99.
+       - With visibility maps: the share of the connections that the maps sample, 0 to 0.99.
          (Default: 0.9)
      * - pilot_spp
        - |int|
-       - With visibility maps: pilot samples per pixel, at most a quarter of all samples. They count
-         towards the image. (Default: 4)
+       - With visibility maps: number of pilot samples per pixel, at most a quarter of all samples.
+         They count towards the image. (Default: 4)
      * - save_learned, load_learned
        - |string|
        - With visibility maps: as in :class:`composed_path`. (Default: none)
@@ -66,11 +66,12 @@ class TwoStage(WalkIntegrator):
 
     **Use it when** you compare methods, or when most noise comes from an uneven map that lights
     rough metal, and the number of camera samples is limited for another reason. **Not when** time
-    counts: in all eleven scenes that were measured with indirect light, it was less efficient than
-    :monosp:`path`; its samples mostly have less error, but take longer by a larger factor. Nor for
-    narrow lobes under an even sky, for which BSDF samples are better. Where the light comes through
-    a small opening, :monosp:`visibility` helps, but :monosp:`composed_path` with
-    :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as efficient.
+    matters: in all eleven scenes measured with indirect light, it was less efficient than
+    :monosp:`path`; its samples mostly have less error, but take longer by a larger factor. Do not
+    use it for narrow lobes under an even sky either, for which BSDF samples are better. If the
+    light comes through a small opening, :monosp:`visibility` helps, but :monosp:`composed_path`
+    with :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as
+    efficient.
 
     Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
     are not supported (use :monosp:`prb`); neither are scalar and polarized variants.

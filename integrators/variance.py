@@ -36,7 +36,7 @@ class Variance(mi.AdjointIntegrator):
 
     Renders the nested integrator in independent batches, each with a seed of its own. The image is
     the mean of the batches, and the channels :monosp:`variance.R`, :monosp:`variance.G` and
-    :monosp:`variance.B` estimate the variance of this mean, that is, the squared standard error of
+    :monosp:`variance.B` estimate the variance of this mean, which is the squared standard error of
     each pixel.
 
     .. pluginparameters::
@@ -46,48 +46,49 @@ class Variance(mi.AdjointIntegrator):
        - Number of batches, 2 to 65536. (Default: 16)
      * - (Nested plugin)
        - |integrator|
-       - The integrator to render with, exactly one. It may be any that renders an image.
+       - The integrator to render with, exactly one. Any integrator that renders an image is
+         accepted.
 
     **Use it when** you need error bars, a noise map for a denoiser, or weights for comparing
     images, and the integrator does not work with Mitsuba's :monosp:`moment`, such as
-    :monosp:`ptracer` or one that learns. **Not when** the nested integrator profits from one long
-    render: it learns anew in each batch (with a sixteenth of the samples, at the defaults), and a
-    structured sampler stratifies the samples of each batch only. Otherwise the cost is that of the
-    nested integrator, plus reading each batch back: choose batches of several samples per pixel.
+    :monosp:`ptracer` or one that learns. **Not when** the nested integrator benefits from one long
+    render: it learns again in each batch (with a sixteenth of the samples, by default), and a
+    structured sampler stratifies the samples of each batch only. Otherwise, the only extra cost is
+    reading each batch back: choose batches of several samples per pixel.
 
     **Meaning of the variance.** It is the variance of the image, which is the mean of all samples,
-    not that of one sample (for an independent sampler and the box filter, that is variance · spp).
-    A variance that is estimated from n batches has itself a relative standard error of about √(2 /
-    (n - 1)): 37 % from 16 batches, 13 % from 128; more where the noise has heavy tails. Average it
-    over pixels before you rely on it. With a reconstruction filter wider than a pixel, the errors
-    of neighbouring pixels are correlated: a mean over pixels then has more variance than
+    and not the variance of one sample (for an independent sampler and the box filter, the latter is
+    variance · spp). A variance estimated from n batches itself has a relative standard error of
+    about √(2 / (n - 1)): 37 % from 16 batches, 13 % from 128; more if the noise has heavy tails.
+    Average it over pixels before you rely on it. With a reconstruction filter wider than a pixel,
+    the errors of neighbouring pixels are correlated: a mean over pixels then has more variance than
     independent pixels would give it. Each batch divides by the filter weights of its own samples.
-    This biases pixels at an edge, with one sample per batch by up to 1 % of its contrast, with four
-    by a quarter of that. Filters with negative lobes, such as :monosp:`lanczos`, need at least four
-    samples per batch; the box filter has no bias.
+    This biases pixels at an edge: by up to 1 % of its contrast with one sample per batch, and by a
+    quarter of that with four. Filters with negative lobes, such as :monosp:`lanczos`, need at least
+    four samples per batch; the box filter has no bias.
 
-    **Samples.** Each batch takes spp / batches samples per pixel, rounded up (by stratified
-    samplers to a number that they support). It renders at least 2 batches, and as many as are
-    needed to reach spp. So there can be fewer batches than requested; with more than two, the
-    excess is less than one batch. At least 2 samples per pixel are needed. A :monosp:`timeout` of
-    the nested integrator applies to each batch.
+    **Samples.** Each batch takes spp / batches samples per pixel, rounded up (with stratified
+    samplers, to a number that they support). It renders at least 2 batches, and as many as are
+    needed to reach spp. There can therefore be fewer batches than requested; with more than two,
+    the excess is less than one batch. At least 2 samples per pixel are required. A
+    :monosp:`timeout` of the nested integrator applies to each batch.
 
     **Channels.** Names follow the film: for the pixel format :monosp:`luminance` and in monochrome
     variants there is only :monosp:`variance.Y`, for :monosp:`xyz` there are :monosp:`variance.X`,
     :monosp:`variance.Y` and :monosp:`variance.Z`. Alpha has no variance channel. The means of the
     nested integrator's AOVs come before these channels. Set the film's :monosp:`component_format`
-    to :monosp:`float32`: in files of :monosp:`film.write`, the default half precision rounds
-    variances below 6e-8 to zero.
+    to :monosp:`float32`: in files written by :monosp:`film.write`, the default half precision
+    rounds variances below 6e-8 to zero.
 
     Ctrl-C, and :monosp:`cancel()` after the running batch, keep the image of the finished batches
     (after a single batch, the variance is NaN: unknown). :monosp:`progress` is called after each
     batch; :monosp:`nested` is the nested integrator. :monosp:`statistics` is the sum over the
-    batches if the nested integrator has statistics. Gradients are not supported, nor are
+    batches if the nested integrator has statistics. Gradients are not supported; neither are
     :monosp:`specfilm`, and scalar and polarized variants. It cannot be nested in :monosp:`aov` or
-    :monosp:`moment`; nest those in it.
+    :monosp:`moment`; nest these in it instead.
 
-    Source: batch means are textbook statistics; the update is that of B. P. Welford, *Note on a
-    Method for Calculating Corrected Sums of Squares and Products*, Technometrics 4(3), 1962.
+    Source: batch means are textbook statistics; the update follows B. P. Welford, *Note on a Method
+    for Calculating Corrected Sums of Squares and Products*, Technometrics 4(3), 1962.
 
     .. tabs::
         .. code-tab:: xml

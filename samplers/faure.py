@@ -28,15 +28,15 @@ class FaureSampler(SequenceSampler):
        - The parameters of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
-       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
-         further random copies of the sequence. (Default: 4)
+       - Number of dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more
+         dimensions gets further random copies of the sequence. (Default: 4)
 
-    **Use it when** the number of samples is a power of the base, 25 for example. **Not when** it is
+    **Use it when** the number of samples is a power of the base, for example 25. **Not when** it is
     any other number: :monosp:`sobol_owen` then has less error.
 
-    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
-    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
-    all passes only in part.
+    Each pixel and each seed has its own points. All integrators can use this sampler. If an
+    integrator of Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are
+    stratified over all passes only in part.
 
     Source: H. Faure, *Discrépance de suites associées à un système de numération (en dimension s)*,
     Acta Arithmetica 41, 1982.

@@ -16,63 +16,63 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     -----------------------------------------------
 
     A decision for the slot :monosp:`directions` of :monosp:`composed_path`. It learns from the
-    first samples which random numbers make the BSDF sample directions from which light comes, and
-    draws these numbers more often. It is unbiased, needs no knowledge of materials and lights, and
-    guides all BSDFs in the same way. :monosp:`pss_guided` is a path tracer with this decision.
+    first samples which random numbers lead the BSDF to sample directions from which light comes,
+    and draws these numbers more often. It is unbiased, needs no knowledge of materials and lights,
+    and guides all BSDFs in the same way. :monosp:`pss_guided` is a path tracer with this decision.
 
     .. pluginparameters::
 
      * - regions
        - |string|
        - What a tree of samples belongs to. :monosp:`surfaces`: a voxel and a side of the surfaces
-         in it; every bounce uses the tree of the place where it happens. :monosp:`tiles`: a tile of
-         the film, as in the thesis; the sample of a path's first bounce decides which tree the
-         second uses, and so on. (Default: surfaces)
+         in it; every bounce uses the tree of its place. :monosp:`tiles`: a tile of the film, as in
+         the thesis; the sample of a path's first bounce decides which tree the second uses, and so
+         on. (Default: surfaces)
      * - tile
        - |int|
        - Edge of a tile in pixels; accepted only with :monosp:`tiles`. (Default: 16)
      * - bounces
        - |int|
-       - How many directions of a path are guided, at most; 64 at most, with tiles 5. Later bounces
-         that are not worth the time are not guided. (Default: 6; 2 with tiles)
+       - Maximum number of directions of a path that are guided, up to 64 (with tiles, up to 5).
+         Later bounces that are not worth the time are not guided. (Default: 6; 2 with tiles)
      * - always_guide
        - |bool|
-       - Guide all :monosp:`bounces`, also where the pilots show that guiding does not pay? If so,
-         images of different seeds, and the frames of an animation, are all rendered in the same way
-         and with the same kernels. (Default: false)
+       - Whether to guide all :monosp:`bounces`, even if the pilots show that guiding does not pay.
+         If so, images with different seeds, and the frames of an animation, are all rendered in the
+         same way and with the same kernels. (Default: false)
      * - max_memory
        - |float|
-       - Memory for what is recorded and learned, in MiB. Where the pilots need more, they record a
-         part of their paths only. The trees of tiles of a few pixels take additional memory.
-         (Default: 512)
+       - Memory for what is recorded and learned, in MiB. If the pilots need more, they record only
+         a part of their paths. The trees of tiles of a few pixels take additional memory. (Default:
+         512)
 
-    **Use it when** light arrives by way of other surfaces: through doors, windows and gaps, from
-    lit corners, along mirrors and glossy things. **Not when** most light is direct (choose lights
-    better then: :monosp:`learned_lights`), when an image has fewer than 16 samples per pixel, or
-    for caustics of small lights seen through glass, which paths from the camera do not find.
+    **Use it when** light arrives indirectly: through doors, windows and gaps, from lit corners, via
+    mirrors and glossy objects. **Not when** most light is direct (then choose lights better, with
+    :monosp:`learned_lights`), when an image has fewer than 16 samples per pixel, or for caustics of
+    small lights seen through glass, which camera paths do not find.
 
     Each tree is a k-d tree over the two numbers with which a BSDF samples a direction. Its density
-    is proportional to the mean light that paths found from there on. Where there are few samples,
-    it is drawn towards the mean of larger surroundings. It is mixed with uniform numbers. The
-    second pilot draws from the trees of the first, and measures their gain. This decides the share
-    of samples that trees draw (40, 60 or 80 %), and how many bounces are worth the time of guiding
-    them. If none is, learning ends there, and directions are those of :monosp:`path`. With fewer
-    than 3 pilot samples per pixel (:monosp:`pilot_spp` of the integrator) nothing is guided. After
-    a render, :monosp:`integrator.statistics.learned` describes what was learned, and
-    :monosp:`integrator.learners["directions"].guide` is the learned guide (see
-    examples/learned_samples.py).
+    is proportional to the mean light that paths found from that vertex on. If a cell has few
+    samples, the density is drawn towards the mean of a larger neighbourhood. The density is mixed
+    with uniform numbers. The second pilot draws from the trees of the first, and measures their
+    gain. This decides the share of samples that trees draw (40, 60 or 80 %), and how many bounces
+    are worth the time of guiding them. If no bounce is worth it, learning ends, and directions are
+    sampled as in :monosp:`path`. With fewer than 3 pilot samples per pixel (:monosp:`pilot_spp` of
+    the integrator), nothing is guided. After a render, :monosp:`integrator.statistics.learned`
+    describes what was learned, and :monosp:`integrator.learners["directions"].guide` is the learned
+    guide (see examples/learned_samples.py).
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, to no effect). With regions of surfaces, Russian roulette is learned as
     well (:monosp:`roulette` of :monosp:`composed_path`): it continues paths that are expected to
-    find light, which a roulette by throughput alone would end. Without that, guided paths would
+    find light, but that a roulette by throughput alone would end. Without it, guided paths would
     lose much of their gain. Nested in :monosp:`moment`, the integrator takes no pilot samples, and
     nothing is guided.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light
-    Transport Simulation*, 2016: roulette (without splitting). Regions of surfaces, the estimates,
-    and the measurement of the gain are ours.
+    Transport Simulation*, 2016: roulette (without splitting). The regions of surfaces, the
+    estimates, and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

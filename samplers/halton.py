@@ -17,8 +17,8 @@ class HaltonSampler(SequenceSampler):
     Halton sequence (:monosp:`halton`)
     ----------------------------------
 
-    Points of the Halton sequence: the radical inverse of the sample's number in another prime base
-    for each dimension, with digits that are permuted at random.
+    Points of the Halton sequence: the radical inverse of the sample's index, in a different prime
+    base for each dimension, with randomly permuted digits.
 
     .. pluginparameters::
 
@@ -27,14 +27,15 @@ class HaltonSampler(SequenceSampler):
        - The parameters of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
-       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
-         further random copies of the sequence. (Default: 4)
+       - Number of dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more
+         dimensions gets further random copies of the sequence. (Default: 4)
 
-    **Use it when** you compare sequences. **Not when** time counts: :monosp:`sobol_owen` is faster.
+    **Use it when** you compare sequences. **Not when** time matters: :monosp:`sobol_owen` is
+    faster.
 
-    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
-    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
-    all passes only in part.
+    Each pixel and each seed has its own points. All integrators can use this sampler. If an
+    integrator of Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are
+    stratified over all passes only in part.
 
     Source: J. H. Halton, *On the Efficiency of Certain Quasi-random Sequences of Points in
     Evaluating Multi-dimensional Integrals*, Numerische Mathematik 2, 1960.

@@ -17,8 +17,8 @@ class HammersleySampler(SequenceSampler):
     Hammersley set (:monosp:`hammersley`)
     -------------------------------------
 
-    Points of the Hammersley set: the first dimension is the sample's number divided by the number
-    of samples, the others are those of :monosp:`halton`.
+    Points of the Hammersley set: the first dimension is the sample's index divided by the number of
+    samples, and the others are the same as in :monosp:`halton`.
 
     .. pluginparameters::
 
@@ -27,15 +27,15 @@ class HammersleySampler(SequenceSampler):
        - The parameters of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
-       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
-         further random copies of the sequence. (Default: 4)
+       - Number of dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more
+         dimensions gets further random copies of the sequence. (Default: 4)
 
     **Use it when** you compare sequences. **Not when** a render may be cut short by
     :monosp:`timeout`: the first samples alone are not spread evenly.
 
-    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
-    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
-    all passes only in part.
+    Each pixel and each seed has its own points. All integrators can use this sampler. If an
+    integrator of Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are
+    stratified over all passes only in part.
 
     Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, Annals of
     the New York Academy of Sciences 86, 1960.

@@ -17,7 +17,7 @@ class LatinHypercubeSampler(SequenceSampler):
     Latin hypercube (:monosp:`latin_hypercube`)
     -------------------------------------------
 
-    Each random number of a path is stratified on its own: [0, 1) is divided into as many intervals
+    Each random number of a path is stratified separately: [0, 1) is divided into as many intervals
     as there are samples, and each interval gets one number.
 
     .. pluginparameters::
@@ -26,12 +26,12 @@ class LatinHypercubeSampler(SequenceSampler):
        - |int|
        - The parameters of :class:`SequenceSampler`: sample_count, seed.
 
-    **Use it when** you compare sequences. **Not when** you want the least error:
+    **Use it when** you compare sequences. **Not when** you want the lowest error:
     :monosp:`sobol_owen` stratifies pairs of numbers as well.
 
-    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
-    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
-    all passes only in part.
+    Each pixel and each seed has its own points. All integrators can use this sampler. If an
+    integrator of Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are
+    stratified over all passes only in part.
 
     Source: M. D. McKay, R. J. Beckman, W. J. Conover, *A Comparison of Three Methods for Selecting
     Values of Input Variables in the Analysis of Output from a Computer Code*, Technometrics 21(2),

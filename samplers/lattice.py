@@ -17,8 +17,8 @@ class LatticeSampler(SequenceSampler):
     Rank-1 lattice (:monosp:`lattice`)
     ----------------------------------
 
-    Multiples of one vector, modulo 1, each dimension shifted at random. The vector is good for any
-    power of two of samples.
+    Multiples of one vector, modulo 1, with a random shift in each dimension. The vector works well
+    for any power of two of samples.
 
     .. pluginparameters::
 
@@ -27,15 +27,15 @@ class LatticeSampler(SequenceSampler):
        - The parameters of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
-       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
-         further random copies of the sequence. (Default: 4)
+       - Number of dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more
+         dimensions gets further random copies of the sequence. (Default: 4)
 
     **Use it when** radiance is smooth within a pixel. **Not when** edges cross most pixels: points
     of a lattice lie in rows.
 
-    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
-    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
-    all passes only in part.
+    Each pixel and each seed has its own points. All integrators can use this sampler. If an
+    integrator of Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are
+    stratified over all passes only in part.
 
     Source: R. Cools, F. Y. Kuo, D. Nuyens, *Constructing Embedded Lattice Rules for Multivariate
     Integration*, SIAM J. Sci. Comput. 28(6), 2006.

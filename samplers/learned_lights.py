@@ -16,55 +16,56 @@ class LearnedLightsPlugin(DecisionPlugin):
     -----------------------------------------
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It learns from the
-    first samples which lights reach which surfaces, and samples lights accordingly, also parts of
-    large lights and directions of the sky. It is unbiased. :monosp:`neepp` is a path tracer with
+    first samples which lights reach which surfaces, and samples lights accordingly, including parts
+    of large lights and directions of the sky. It is unbiased. :monosp:`neepp` is a path tracer with
     this decision.
 
     .. pluginparameters::
 
      * - target
        - |string|
-       - What decides the probability of a light, for each voxel and side of a surface: its
+       - What determines the probability of a light, for each voxel and side of a surface: its
          :monosp:`contribution` (the light that arrived from it), or its :monosp:`visibility` (how
          often it was visible, times its unoccluded contribution). (Default: contribution)
      * - grid
        - |int|
-       - Voxels along each axis of the region in which paths scatter, 1 to 1024. (Default: 16, or
-         fewer where the pilots have few samples for the voxels that they see and the lights)
+       - Number of voxels along each axis of the region in which paths scatter, 1 to 1024. (Default:
+         16, or fewer if the pilots have few samples for the number of visible voxels and lights)
      * - max_memory
        - |float|
-       - Memory for what is learned, in MiB. Where :monosp:`grid` needs more, a coarser grid is
-         used, with a warning. (Default: 512)
+       - Memory for what is learned, in MiB. If :monosp:`grid` needs more, a coarser grid is used,
+         with a warning. (Default: 512)
      * - save_map
        - |string|
-       - File to which the learned map is written; its folder must exist. (Default: none)
+       - File to which the learned map is saved; its folder must exist. (Default: none)
      * - load_map
        - |string|
-       - File of a map to start from, learned from this view of the scene or another one; the pilots
-         add to it. A map of another scene is refused. (Default: none)
+       - File from which an initial map is loaded, learned from this view of the scene or from
+         another one; the pilots add to it. A map of another scene is refused. (Default: none)
 
-    **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
+    **Use it when** there are many lights, when most lights are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
-    when** one small light lights an open scene, or when most noise comes from indirect or glossy
-    light: it then costs the time of learning.
+    when** one small light illuminates an open scene, or when most noise comes from indirect or
+    glossy light: learning then costs time and gains nothing.
 
     A first sample per pixel, which is not added to the film, finds the surfaces and the region in
-    which paths scatter. Each pilot but the first chooses its lights by what the earlier pilots have
-    learned. All samples have the same weight, and no stage uses what its own samples teach, so that
-    the image is unbiased. A tenth of the choices does not depend on what was learned. The second
-    and the third pilot measure by how much the variance of the image is lower than with the choice
-    of :monosp:`path`. If it is lower by less than about 15 %, the table is not worth the time of
-    its look-ups, and learning ends there, unless :monosp:`grid`, a file of a map, or a
-    :monosp:`visibility_roulette` beside it is given.
+    which paths scatter. Each pilot except the first chooses its lights by what the earlier pilots
+    have learned. All samples have the same weight, and no stage uses what it learns from its own
+    samples, so the image is unbiased. A tenth of the choices do not depend on what was learned. The
+    second and third pilots measure how much lower the variance of the image is than with the choice
+    of :monosp:`path`. If the reduction is less than about 15 %, the table is not worth the time of
+    its look-ups, and learning ends, unless :monosp:`grid`, a map file, or also a
+    :monosp:`visibility_roulette` is given.
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
-    :monosp:`path` is biased there, by a fault in Mitsuba. Nested in :monosp:`moment`, the
-    integrator takes no pilot samples, and lights are chosen as by :monosp:`path`.
+    :monosp:`path` is biased for these lights, because of a fault in Mitsuba. Nested in
+    :monosp:`moment`, the integrator takes no pilot samples, and lights are chosen as by
+    :monosp:`path`.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, section 4.2
-    (choosing by visibility). Sides of surfaces, parts of lights, contributions, and the measurement
-    of the gain are ours.
+    (choosing by visibility). The sides of surfaces, the parts of lights, the contributions, and the
+    measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

@@ -17,32 +17,32 @@ class MisHeuristicPlugin(DecisionPlugin):
 
     A decision for the slot :monosp:`mis` of :monosp:`composed_path`. Two techniques find the same
     light: connections to it, and BSDF samples that hit it. The heuristic weights both by their
-    densities, so that the image is unbiased.
+    densities in a way that keeps the image unbiased.
 
     .. pluginparameters::
 
      * - heuristic
        - |string|
-       - :monosp:`power` (weights in proportion to a power of the densities), :monosp:`balance` (to
-         the densities), :monosp:`cutoff` (as balance, but a density that is much smaller than the
-         other one has no weight), :monosp:`maximum` (the larger density has all weight),
-         :monosp:`bsdf` (BSDF samples alone; light that they cannot find is connected to all the
-         same), or :monosp:`light` (connections alone; what they cannot find is left to BSDF
-         samples). (Default: power)
+       - :monosp:`power` (weights proportional to a power of the densities), :monosp:`balance`
+         (weights proportional to the densities), :monosp:`cutoff` (as balance, but a technique
+         whose density is much smaller than the other one has weight 0), :monosp:`maximum` (the
+         technique with the larger density has weight 1), :monosp:`bsdf` (BSDF samples only, with
+         connections to light that they cannot find), or :monosp:`light` (connections only, with
+         BSDF samples for light that connections cannot find). (Default: power)
      * - exponent
        - |float|
-       - Of :monosp:`power`, 1 to 64. (Default: 2)
+       - The exponent of :monosp:`power`, 1 to 64. (Default: 2)
      * - threshold
        - |float|
-       - Of :monosp:`cutoff`: a density below this share of the other one has no weight, 0 to 1.
-         (Default: 0.1)
+       - The threshold of :monosp:`cutoff`, 0 to 1: a technique whose density is below this fraction
+         of the other one has weight 0. (Default: 0.1)
 
     **Use it when** you compare heuristics, or teach. **Not when** you want low noise without
-    experiments: :monosp:`power` with the exponent 2, which :monosp:`path` uses, is seldom much
-    worse than any other.
+    experiments: :monosp:`power` with exponent 2, which :monosp:`path` uses, is seldom much worse
+    than any other heuristic.
 
     Connections whose weight is 0 trace no shadow ray. Paths continue in the directions of their
-    BSDF samples, also if these have the weight 0.
+    BSDF samples, even if these have weight 0.
 
     Source: E. Veach, PhD thesis, 1997, section 9.2; H. W. Jensen et al., *Monte Carlo Ray Tracing*,
     SIGGRAPH 2003 course 44, sections 5.3 and 5.4.

@@ -16,33 +16,33 @@ class PortalLightsPlugin(DecisionPlugin):
     ------------------------------------------------------------
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. From each vertex, it
-    samples the part of the environment that is seen through the openings that shapes of the type
-    :monosp:`portal` mark, in proportion to its radiance.
+    samples the part of the environment visible through openings, in proportion to its radiance.
+    Shapes of type :monosp:`portal` mark these openings.
 
     .. pluginparameters::
 
      * - share
        - |float|
        - The share of the connections to the environment that are sampled through portals, 0 to
-         0.99. The others are sampled as by :monosp:`path`, and find light that no portal shows.
-         (Default: 0.9)
+         0.99. The other connections are sampled as by :monosp:`path`, and find light that no portal
+         shows. (Default: 0.9)
 
-    **Use it when** a room is lit through windows by a sky (:monosp:`envmap`, :monosp:`sunsky`,
-    :monosp:`constant`). **Not when** a sun shines in: most noise then comes from the light that its
-    patch reflects, which portals do not reduce, and a sample takes two to four times as long; or
-    when most of the picture is outdoors. Not for :monosp:`bdpt` and other integrators with light
+    **Use it when** a sky (:monosp:`envmap`, :monosp:`sunsky`, :monosp:`constant`) lights a room
+    through windows. **Not when** the sun shines in: most noise then comes from the light reflected
+    by the sunlit patch, which portals do not reduce, and a sample takes two to four times as long;
+    or when most of the picture is outdoors. Not for :monosp:`bdpt` and other integrators with light
     paths.
 
-    For each orientation of portals, the environment is stored in coordinates in which the part that
-    is seen through a portal, from any point, is an axis-aligned rectangle, with a summed-area table
-    in double precision. Each axis covers 180° with as many texels as the map has columns, 256 to
+    For each orientation of portals, the environment is stored, with a summed-area table in double
+    precision, in coordinates in which the part visible through a portal from any point is an
+    axis-aligned rectangle. Each axis covers 180° with as many texels as the map has columns, 256 to
     2048 (12 bytes for each texel). A portal is chosen by the sum over its rectangle. Only the edges
-    of the portal are known, not objects in the opening or before it. The part of a portal that lies
-    below the surface at a vertex is sampled in vain.
+    of the portal are known, not objects in the opening or in front of it. Samples through the part
+    of a portal below the surface at a vertex are wasted.
 
-    The density is exact and known in every direction, so that BSDF samples take part by MIS. Where
-    no portal is seen from inside, for lights other than the environment, and in scenes without
-    portals or environment, lights are sampled as by :monosp:`path`.
+    The density is exact and known in every direction, so it can be combined with BSDF samples by
+    MIS. At points that see no portal from inside, for lights other than the environment, and in
+    scenes without portals or environment, lights are sampled as by :monosp:`path`.
 
     Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
     Graphics Forum 34(4), 2015. The share of ordinary samples is ours.

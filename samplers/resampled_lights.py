@@ -16,28 +16,28 @@ class ResampledLightsPlugin(DecisionPlugin):
     ---------------------------------------------
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`: resampled importance
-    sampling. Each connection takes several candidates: light samples as of :monosp:`path`; where
-    there is an environment, half of the candidates are BSDF samples, which are looked up in it. It
-    evaluates BSDF and light for all of them, chooses one in proportion to its unoccluded
-    contribution, and traces one shadow ray.
+    sampling. Each connection draws several candidates. These are light samples, as in
+    :monosp:`path`; if there is an environment, half of the candidates are BSDF samples, which are
+    looked up in it. The connection evaluates BSDF and light for all candidates, chooses one in
+    proportion to its unoccluded contribution, and traces one shadow ray.
 
     .. pluginparameters::
 
      * - candidates
        - |int|
-       - Candidates of a connection, 1 to 1024. (Default: 8)
+       - Number of candidates of a connection, 1 to 1024. (Default: 8)
 
-    **Use it when** lights are many, large or unlike each other, or glossy things reflect an
-    environment, and most of the light is visible. **Not when** walls hide most of it: the choice
-    ignores occlusion (:monosp:`learned_lights` does not).
+    **Use it when** there are many lights, or large or dissimilar ones, or glossy objects reflect an
+    environment, and most of the light is visible. **Not when** walls hide most of the light: the
+    choice ignores occlusion (:monosp:`learned_lights` takes it into account).
 
     MIS with BSDF samples uses the density of all candidates together, times their number. The image
     is unbiased. Not for :monosp:`bdpt` and other integrators with light paths: these do not provide
     the density with which the BSDF would have sampled the light.
 
     Source: J. Talbot, D. Cline, P. Egbert, *Importance Resampling for Global Illumination*, EGSR
-    2005; D. Cline, PhD dissertation, BYU, 2007, section 4.4.4. That MIS may use the density of the
-    candidates, and lattices as candidates, are our addition.
+    2005; D. Cline, PhD dissertation, BYU, 2007, section 4.4.4. The use of the density of the
+    candidates in MIS, and lattices as candidates, are our additions.
 
     .. tabs::
         .. code-tab:: xml

@@ -23,19 +23,19 @@ class SpatialLightsPlugin(DecisionPlugin):
 
      * - grid
        - |int|
-       - Voxels along each axis of the scene's bounding box, 1 to 1024. (Default: 32, or what fits
-         into the memory)
+       - Number of voxels along each axis of the scene's bounding box, 1 to 1024. (Default: 32, or
+         what fits into the memory)
      * - max_memory
        - |float|
-       - Memory for the table of probabilities, in MiB. Where :monosp:`grid` needs more, a coarser
-         grid is used, with a warning. (Default: 512)
+       - Memory for the table of probabilities, in MiB. If :monosp:`grid` needs more, a coarser grid
+         is used, with a warning. (Default: 512)
 
     **Use it when** there are many lights, and most places see the lights near them. **Not when**
-    walls hide most of them: :monosp:`learned_lights` takes walls into account, and also divides
-    large lights and the sky. With a single light it changes nothing.
+    walls hide most lights: :monosp:`learned_lights` takes walls into account, and also divides
+    large lights and the sky. With a single light, it has no effect.
 
-    Points outside of all voxels with geometry share one row of the table. No light has less than a
-    thousandth of the mean of its row, so that a wrong estimate cannot rule it out.
+    Points outside all voxels with geometry share one row of the table. No light has less than a
+    thousandth of the mean of its row, so a wrong estimate cannot exclude it.
 
     Source: the light distribution :monosp:`spatial` of pbrt-v3 (src/core/lightdistrib.cpp).
 

@@ -26,13 +26,13 @@ class TwoStageLightsPlugin(DecisionPlugin):
 
      * - splits
        - |int|
-       - How often a vertex divides rectangles, at most, in addition to the first division into
-         eight, 0 to 1024. The source makes as many divisions as a vertex has connections. (Default:
-         16)
+       - Maximum number of times that a vertex divides rectangles, in addition to the first division
+         into eight, 0 to 1024. The source makes as many divisions as a vertex has connections.
+         (Default: 16)
      * - vertices
        - |string|
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
-         others, lights are chosen as by :monosp:`path`. (Default: first)
+         other vertices, lights are chosen as by :monosp:`path`. (Default: first)
      * - visibility
        - |string|
        - How connections of first vertices take occlusion into account: not at all
@@ -40,39 +40,39 @@ class TwoStageLightsPlugin(DecisionPlugin):
          (:monosp:`primary`) or over directions (:monosp:`world`). (Default: unknown)
      * - reallocated
        - |float|
-       - With visibility maps: the share of the connections that are sampled by them, 0 to 0.99. The
-         others ignore visibility. (Default: 0.9)
+       - With visibility maps: the share of the connections that the maps sample, 0 to 0.99. The
+         other connections ignore visibility. (Default: 0.9)
 
-    **Use it when** rough metal reflects an uneven map, most of which is not hidden from it, and
-    each vertex has several :monosp:`connections`. These share the partition of the vertex, which
-    takes longer to make than a path. **Not when** walls or other objects hide the bright parts of
-    the map, unless :monosp:`visibility` is learned (the word :monosp:`triple_product` stands for
-    this decision with maps in primary space); or for lobes that are nearly those of mirrors, which
-    BSDF samples find better.
+    **Use it when** rough metal reflects an uneven map, most of which is visible from it, and each
+    vertex has several :monosp:`connections`. These share the partition of the vertex, which takes
+    longer to make than a path. **Not when** walls or other objects hide the bright parts of the
+    map, unless :monosp:`visibility` is learned (the word :monosp:`triple_product` stands for this
+    decision with maps in primary space); or for lobes nearly as narrow as a mirror's, for which
+    BSDF samples are better.
 
     With :monosp:`visibility`, the integrator takes a pilot of :monosp:`pilot_spp` samples per pixel
-    (by default 4, at most a quarter of all; they count towards the image). It counts, for each tile
-    of 8 pixels (larger ones where there would be more than 8192), which shadow rays of first
-    vertices are unoccluded: in 16 x 16 cells of the two random numbers that choose a direction, or
-    in 32 x 16 cells of the map. The prior of a cell is the same cell of the surrounding tiles,
-    whose prior is the mean over these tiles. In primary space, the random numbers of later samples
-    are distributed in proportion to the square root of the visibility. With :monosp:`world`, the
-    rectangles of the partition are weighted by it, and divided where it varies; use more
-    :monosp:`splits` then. Densities stay exact and positive, so the image is unbiased whatever the
-    maps contain. Maps need no correction, and are not made on demand: a map is an array of
-    counters, and every connection still traces its shadow ray.
+    (by default 4, at most a quarter of all; they count towards the image). For each tile of 8
+    pixels (larger ones if there would be more than 8192 tiles), it counts which shadow rays of
+    first vertices are unoccluded: in 16 x 16 cells of the two random numbers that choose a
+    direction, or in 32 x 16 cells of the map. The prior of a cell is the same cell of the
+    surrounding tiles, whose prior is the mean over these tiles. In primary space, the random
+    numbers of later samples are distributed in proportion to the square root of the visibility.
+    With :monosp:`world`, the rectangles of the partition are weighted by the visibility, and
+    divided where it varies; then use more :monosp:`splits`. Densities stay exact and positive, so
+    the image is unbiased whatever the maps contain. Maps need no correction, and they are not made
+    on demand: a map is an array of counters, and every connection still traces its shadow ray.
 
     Lights other than the environment are sampled as by :monosp:`path`, and so are all lights of a
-    scene without an environment. BSDF samples take part by MIS; lobes that are thinner than a texel
-    are left to them. The density is positive wherever the map is defined: a hundredth of it follows
-    the map alone. The table of the map takes 12 bytes for each of its texels. Not for
-    :monosp:`bdpt` and other integrators with light paths.
+    scene without an environment. BSDF samples are combined by MIS; lobes narrower than a texel are
+    left to them. The density is positive wherever the map is defined: a hundredth of it follows the
+    map alone. The table of the map takes 12 bytes for each of its texels. Not for :monosp:`bdpt`
+    and other integrators with light paths.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
     Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5). The order of
-    the divisions, and BSDF samples in the place of the peaks of known models, are ours. Maps of
-    visibility: chapter 6 of the dissertation; probabilities in the place of classes, and densities
-    that MIS knows, are ours.
+    the divisions, and BSDF samples in place of the peaks of known models, are ours. Maps of
+    visibility: chapter 6 of the dissertation; probabilities in place of classes, and densities that
+    MIS can use, are ours.
 
     .. tabs::
         .. code-tab:: xml

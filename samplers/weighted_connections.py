@@ -16,7 +16,7 @@ class WeightedConnectionsPlugin(DecisionPlugin):
     -----------------------------------------------------
 
     A decision for the slot :monosp:`connections` of :monosp:`composed_path`. It connects a vertex
-    to many points on lights. Their random numbers come from well distributed point sets. Each
+    to many points on lights, whose random numbers come from well distributed point sets. Each
     connection can be weighted by the Voronoi cell of its point. :monosp:`reweighted_direct` is a
     path tracer with this decision.
 
@@ -24,9 +24,9 @@ class WeightedConnectionsPlugin(DecisionPlugin):
 
      * - count
        - |int|
-       - Points of a set, which is the number of connections of a vertex; at most 4096 (1024 with
-         :monosp:`poisson_disk`). With 0, light is found by BSDF samples only; point lights and
-         parallel light are connected to anyway. (Default: 16)
+       - Number of points in a set, which is the number of connections of a vertex; at most 4096
+         (1024 with :monosp:`poisson_disk`). With 0, light is found by BSDF samples only; point
+         lights and parallel light are connected to in any case. (Default: 16)
      * - vertices
        - |string|
        - Which vertices of a path have this many connections: the :monosp:`first` (later ones have
@@ -46,17 +46,18 @@ class WeightedConnectionsPlugin(DecisionPlugin):
 
     **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
     materials do not need many camera samples. **Not when** most light is indirect, or the noise
-    comes from edges: more camera samples reduce it more. Compare it with a :monosp:`multijitter`
-    sampler of the sensor, which is hard to beat.
+    comes from edges: more camera samples then reduce it further. Compare it with a
+    :monosp:`multijitter` sampler of the sensor, which is hard to beat.
 
     Each vertex shifts its set around the torus at random (not with :monosp:`voronoi` weights), so
-    that errors of neighbouring pixels are independent. Multiple importance sampling combines these
+    the errors of neighbouring pixels are independent. Multiple importance sampling combines these
     :monosp:`count` connections with one BSDF sample. They can be combined with every
-    :monosp:`next_event`: if it chooses the light by additional random numbers, these come from a
-    lattice, and the set chooses points on the lights. 16 connections take about as long as a path.
+    :monosp:`next_event`: if it uses additional random numbers to choose the light, these come from
+    a lattice, and the set chooses points on the lights. 16 connections take about as long as a
+    path.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
-    that they are unbiased, are our addition.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, which are
+    unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

@@ -45,25 +45,25 @@ class WeightedNumbersPlugin(DecisionPlugin):
 
     The sensor must have an aperture (:monosp:`thinlens`) or a shutter that stays open
     (:monosp:`shutter_open`, :monosp:`shutter_close`); otherwise nothing is reweighted, with a
-    warning. Wavelengths need a spectral variant. A number u chooses four wavelengths by the numbers
-    u + k/4 (modulo 1). If a path keeps all four, its contribution is a function of u with period
-    1/4, and its weight is the cell of u modulo 1/4. If dispersive glass has refracted the path,
-    only the hero wavelength is left, the period is 1, and its weight is the cell of u itself. Both
-    weights occur in one image.
+    warning. Wavelengths need a spectral variant. A number u chooses four wavelengths, through the
+    numbers u + k/4 (modulo 1). If a path keeps all four, its contribution is a function of u with
+    period 1/4, and its weight is the cell of u modulo 1/4. If dispersive glass has refracted the
+    path, only the hero wavelength remains, the period is 1, and its weight is the cell of u itself.
+    Both weights occur in one image.
 
     Sets have as many points as a pixel has samples, at most 1024, or 64 with a :monosp:`timeout`
     (with more samples, a pixel uses several sets). There are at most 32 sets (2 of
     :monosp:`poisson_disk`); with :monosp:`voronoi` weights they are not shifted. The weights apply
     to all channels, including alpha and AOVs. Use a :monosp:`box` filter for the film: a wider
     filter gives samples random weights, whose noise remains however well the points are
-    distributed. Where the integrator is nested in :monosp:`moment`, nothing is reweighted.
+    distributed. If the integrator is nested in :monosp:`moment`, nothing is reweighted.
 
     Around integrators of Mitsuba, use :monosp:`reweighted_lens`, :monosp:`reweighted_time` and
     :monosp:`reweighted_wavelength`.
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1 (time), 4.5.2.2 (wavelengths)
-    and 4.5.2.3 (aperture). Periodic cells, the fact that they are unbiased, and cells modulo 1/4
-    are our addition.
+    and 4.5.2.3 (aperture). Periodic cells, which are unbiased, and cells modulo 1/4 are our
+    additions.
 
     .. tabs::
         .. code-tab:: xml

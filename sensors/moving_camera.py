@@ -24,50 +24,49 @@ class MovingCamera(mi.Sensor):
     Moving camera (:monosp:`moving_camera`)
     ---------------------------------------
 
-    Moves the sensor that is nested in it, rigidly, while its shutter is open: a pan, a tracking
-    shot, a shaken camera. Each ray is that of the nested sensor, in its pose at the time of the
-    ray.
+    Moves the nested sensor rigidly while its shutter is open: a pan, a tracking shot, a shaken
+    camera. Each ray is a ray of the nested sensor, in the sensor's pose at the time of the ray.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |sensor|
        - The sensor that moves, exactly one: :monosp:`perspective`, :monosp:`thinlens`,
-         :monosp:`orthographic`, :monosp:`radiancemeter` or :monosp:`batch`. It has the film, the
-         sampler and the shutter interval (:monosp:`shutter_open`, :monosp:`shutter_close`), as it
-         would without the motion.
+         :monosp:`orthographic`, :monosp:`radiancemeter` or :monosp:`batch`. The film, the sampler
+         and the shutter interval (:monosp:`shutter_open`, :monosp:`shutter_close`) belong to it, as
+         they would without the motion.
      * - pose_0, pose_1, …
        - |transform|
        - Rotations and translations through which the sensor passes. They are applied after its own
          :monosp:`to_world`: a sensor without :monosp:`to_world` is in the poses themselves, which
-         can be a :monosp:`lookat`. In between, positions of the origin are interpolated linearly,
-         rotations by slerp (the shorter way).
+         can be a :monosp:`lookat`. Between the poses, positions of the origin are interpolated
+         linearly, and rotations by slerp (the shorter way).
      * - time_0, time_1, …
        - |float|
-       - The times of the poses: one for each, in increasing order, in the units of the shutter
+       - The times of the poses, one for each pose, in increasing order, in the units of the shutter
          interval.
      * - translate, axis, angle, center, begin, end
        - |vector|, |float|
-       - In place of poses: a displacement and a turn at constant speed, which begin at the sensor's
-         own :monosp:`to_world`; see :monosp:`moving`.
+       - In place of poses: a displacement and a rotation at constant speed, which begin at the
+         sensor's own :monosp:`to_world`; see :monosp:`moving`.
 
     **Use it when** the camera moves or turns visibly between :monosp:`shutter_open` and
     :monosp:`shutter_close`, which must be set: both are 0 by default, and such a sensor sees the
-    scene from where it is at time 0. Before the motion and after it, the camera rests at its two
-    ends. **Not when** the lens or its focus changes during that time: that is not supported.
+    scene from where it is at time 0. Before and after the motion, the camera rests at its start and
+    end pose. **Not when** the lens or its focus changes during that time: this is not supported.
 
-    All integrators can use it, those of Mitsuba too, with any film, crop window and sampler, also
-    next to :monosp:`moving` shapes. Light paths are connected to the lens at the time of the path,
-    if the nested sensor can be connected to: :monosp:`light_tracer`, :monosp:`bdpt` and
-    :monosp:`mlt` render with a :monosp:`perspective` or :monosp:`thinlens` that moves. Mitsuba's
-    :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs one depth for each pixel,
-    refuses moving cameras.
+    All integrators can use it, including Mitsuba's, with any film, crop window and sampler, also
+    together with :monosp:`moving` shapes. If light paths can be connected to the nested sensor,
+    they are connected to the lens at the time of the path: :monosp:`light_tracer`, :monosp:`bdpt`
+    and :monosp:`mlt` render with a moving :monosp:`perspective` or :monosp:`thinlens`. Mitsuba's
+    :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs a single depth for each
+    pixel, refuses moving cameras.
 
     A camera ray costs an additional look-up in a small table and a rotation; kernels of other
     sensors are not affected. :monosp:`mi.traverse` shows the parameters of the nested sensor under
     their usual names. Its shutter interval cannot be changed after loading.
 
-    Errors: other sensors are refused, and so are poses with scales.
+    Errors: other sensors are refused, and so are poses that scale.
 
     Source: R. L. Cook, T. Porter, L. Carpenter, *Distributed Ray Tracing*, 1984; K. Shoemake,
     *Animating Rotation with Quaternion Curves*, 1985 (slerp).

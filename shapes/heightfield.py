@@ -27,66 +27,68 @@ class Heightfield(mi.Mesh):
     Heightfields (:monosp:`heightfield`)
     ------------------------------------
 
-    A regular grid of heights, from an image: terrain, relief, waves. Each cell of the grid is two
-    triangles. They are not stored: heights and acceleration structure take 5.4 bytes for a cell,
-    or 3.4 if the image has 8 or 16 bits. A mesh of the same triangles takes about 200 in Mitsuba.
+    A regular grid of heights from an image: terrain, relief, waves. Each cell of the grid consists
+    of two triangles, which are not stored: heights and acceleration structure take 5.4 bytes per
+    cell, or 3.4 if the image has 8 or 16 bits. A mesh of the same triangles takes about 200 bytes
+    per cell in Mitsuba.
 
     .. pluginparameters::
 
      * - filename
        - |string|
-       - The image: PNG, EXR and all other formats that :monosp:`bitmap` reads. Its first channel
-         is used, as it is stored: never converted from sRGB. Integers are divided by their largest
-         value, so that heights are between 0 and 1.
+       - The image: PNG, EXR and all other formats that :monosp:`bitmap` reads. Its first channel is
+         used as it is stored, and never converted from sRGB. Integers are divided by the largest
+         value of their type, so heights are between 0 and 1.
      * - bitmap
        - |bitmap|
-       - In place of :monosp:`filename`: an image in memory. Only from Python.
+       - In place of :monosp:`filename`: an image in memory (from Python only).
      * - data
        - |tensor|
        - In place of :monosp:`filename`: a tensor of shape (rows, columns) or (rows, columns,
-         channels). Only from Python.
+         channels) (from Python only).
      * - scale
        - |float|
        - The height of the value 1, before :monosp:`to_world`. It may be negative. (Default: 1)
      * - to_world
        - |transform|
-       - Places the heightfield. Before, it covers the square from (−1, −1) to (1, 1), as
-         :monosp:`rectangle` does, with heights along z. Any affine transform that can be inverted
-         is accepted. (Default: none, i.e. identity)
+       - Places the heightfield. Untransformed, it covers the square from (−1, −1) to (1, 1), as
+         :monosp:`rectangle` does, with heights along z. Any invertible affine transform is
+         accepted. (Default: none, i.e. identity)
      * - face_normals
        - |bool|
-       - Whether shading normals are those of the triangles. Otherwise, they are interpolated from
-         those at the vertices, which follow from the differences of neighbouring heights.
+       - Whether shading normals are the normals of the triangles. Otherwise, they are interpolated
+         from normals at the vertices, which follow from the differences of neighbouring heights.
          (Default: false)
      * - flip_normals
        - |bool|
-       - Whether normals point down, to lower z, and not up. (Default: false)
+       - Whether normals point down, towards lower z, instead of up. (Default: false)
      * - (nested plugin)
        - |bsdf| or |several|
        - The material, and the media :monosp:`interior` (below) and :monosp:`exterior` (above).
 
     **Use it when** a surface is given by heights: it takes a fraction of the memory of a mesh, and
-    a grid of 4000 x 4000 cells is ready in half a second.
-    **Not when** it is small and there are many: each heightfield adds to the time in which kernels
-    are compiled. **Not for lights:** an area light on it is refused. Compared with Embree and a
-    mesh of the same triangles, in a grid of 1000 x 1000 cells, camera rays take 1.2 to 1.6 times as
-    long, and rays in all directions 1.3 to 1.5 times (``docs/results/lightweight.md``).
+    a grid of 4000 x 4000 cells is ready in half a second. **Not when** you have many small ones:
+    each heightfield adds to the time that compiling kernels takes. **Not for lights:** an area
+    light on it is refused. Compared with Embree and a mesh of the same triangles, in a grid of 1000
+    x 1000 cells, camera rays take 1.2 to 1.6 times as long, and rays in all directions 1.3 to 1.5
+    times (``docs/results/lightweight.md``).
 
-    Texture coordinates are those of :monosp:`rectangle`, on which Mitsuba shows an image upside
-    down: its first row is at y = −1. A :monosp:`bitmap` texture of the same image shows the same
-    thing at the same place. But its texels have their centres inside of the square, and the
-    outermost heights are on its sides: towards these, both differ by up to half a texel.
+    Texture coordinates are the same as on :monosp:`rectangle`, on which Mitsuba shows an image
+    upside down: its first row is at y = −1. A :monosp:`bitmap` texture of the same image therefore
+    lines up with the heights. However, its texels have their centres inside the square, whereas the
+    outermost heights are on the sides of the square: towards the sides, the two differ by up to
+    half a texel.
 
-    Each cell is divided by the diagonal from (−1, −1) towards (1, 1). The number of a triangle
-    (:monosp:`prim_index`) holds the column of its cell in 15 bits, the row in the next 15, and in
-    one more whether it is on the right of the diagonal. A side has at least 2 and at most 32769
-    heights. No ray passes between two triangles.
+    Each cell is divided by the diagonal in the direction from (−1, −1) to (1, 1). The index of a
+    triangle (:monosp:`prim_index`) holds the column of its cell in 15 bits, the row in the next 15,
+    and one more bit for triangles to the right of the diagonal. A side has at least 2 and at most
+    32769 heights. No ray passes between two triangles.
 
     Only integrators of this package see the surface. **Mitsuba's own**, such as :monosp:`path` or
     :monosp:`aov`, **render the scene without it, and we cannot make them refuse it**; use
-    :monosp:`composed_path`, which is :monosp:`path` otherwise. :monosp:`mi.traverse` shows its
-    material, and a placeholder mesh in place of the heights, which cannot be changed once they are
-    loaded.
+    :monosp:`composed_path`, which is otherwise the same as :monosp:`path`. :monosp:`mi.traverse`
+    shows the material, and a placeholder mesh in place of the heights, which cannot be changed
+    after loading.
 
     Source: D. Cline, PhD dissertation, Brigham Young University, 2007, section 3.3.3 (lightweight
     bounding volumes of regular tessellations); here with ranges of heights instead of boxes, and

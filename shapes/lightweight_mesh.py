@@ -21,8 +21,8 @@ class LightweightMesh(mi.Mesh):
     Lightweight meshes (:monosp:`lightweight_mesh`)
     -----------------------------------------------
 
-    Finds the triangles of the mesh that is nested in it by an acceleration structure of 3.3 bytes
-    for each triangle. That of Embree, in Mitsuba, has about 70, and 110 while it is built.
+    Finds the triangles of a nested mesh with an acceleration structure of 3.3 bytes per triangle.
+    Embree's structure, in Mitsuba, takes about 70 bytes per triangle, and 110 while it is built.
 
     .. pluginparameters::
 
@@ -30,48 +30,48 @@ class LightweightMesh(mi.Mesh):
        - |shape|
        - The mesh: :monosp:`ply`, :monosp:`obj`, :monosp:`serialized`, or any other shape that
          Mitsuba represents by triangles, with its material, and with its light or media, if it has
-         some.
+         any.
      * - quantized
        - |bool|
-       - Whether corners are rounded to 65536 steps along each axis of the mesh's box, normals to
-         steps of a few thousandths of a degree, and texture coordinates to 65536 steps between
-         their smallest and their largest value. The mesh then takes 12 to 16 bytes for each
-         triangle in all, more where vertices are shared by few triangles; else 21 to 31, as Mitsuba
-         stores it. (Default: false)
+       - Whether vertices are rounded to 65536 steps along each axis of the mesh's bounding box,
+         normals to steps of a few thousandths of a degree, and texture coordinates to 65536 steps
+         between their smallest and largest value. The mesh then takes 12 to 16 bytes per triangle
+         in all, or more if vertices are shared by few triangles; otherwise, 21 to 31 bytes, as
+         Mitsuba stores it. (Default: false)
 
     **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
-    regular grid of heights, :monosp:`heightfield` takes far less.
-    **Not when** it fits: all rays that meet the box of the mesh take longer. Compared with Embree,
-    in a mesh of a million triangles, camera rays take 3.6 times as long, rays in all directions 3.5
-    times, shadow rays 2.2 times; more in a whole scene as one mesh (5 to 7 times in all directions,
-    ``docs/results/lightweight.md``). Each lightweight mesh has a structure of its own and adds to
-    the time in which kernels are compiled: use it for a few large meshes, and not for many small
+    regular grid of heights, :monosp:`heightfield` takes far less memory. **Not when** the scene
+    fits: all rays that meet the bounding box of the mesh take longer. Compared with Embree, in a
+    mesh of a million triangles, camera rays take 3.6 times as long, rays in all directions 3.5
+    times, shadow rays 2.2 times; more for a whole scene as one mesh (5 to 7 times for rays in all
+    directions, ``docs/results/lightweight.md``). Each lightweight mesh has its own structure and
+    adds to the time that compiling kernels takes: use it for a few large meshes, not for many small
     ones.
 
-    All surface data of the mesh are those of Mitsuba: normals, texture coordinates, vertex and face
-    attributes, materials, media, and area lights of any type. Triangles are sorted: the variable
-    :monosp:`prim_index` counts them in another order than the file. No ray passes between two
-    triangles that share an edge or a corner; it does in Embree, as Mitsuba uses it, for one of
-    seven rays that are aimed exactly at an edge.
+    All surface data of the mesh are the same as in Mitsuba: normals, texture coordinates, vertex
+    and face attributes, materials, media, and area lights of any type. Triangles are sorted: the
+    variable :monosp:`prim_index` numbers them in a different order than the file. No ray passes
+    between two triangles that share an edge or a vertex. With Embree, as Mitsuba uses it, one in
+    seven rays aimed exactly at an edge does.
 
-    With :monosp:`quantized`, area lights and attributes are refused. Meshes that touch are rounded
-    each on its own grid, and there may be gaps between them of the size of a step.
+    With :monosp:`quantized`, area lights and attributes are refused. Touching meshes are each
+    rounded on a grid of their own, so there may be gaps of one step between them.
 
     Only integrators of this package see these triangles. **Mitsuba's own**, such as :monosp:`path`
     or :monosp:`aov`, **render the scene without them, and we cannot make them refuse it** (a light
     among them is still sampled, with a wrong weight); use :monosp:`composed_path`, which is
-    :monosp:`path` otherwise. The parameter :monosp:`aovs` of our integrators sees them; its
-    :monosp:`sh_normal` is without normal and bump maps.
+    otherwise the same as :monosp:`path`. The parameter :monosp:`aovs` of our integrators supports
+    them; its :monosp:`sh_normal` ignores normal and bump maps.
 
-    A lightweight mesh cannot be nested in :monosp:`moving`, and is not seen in a
+    A lightweight mesh cannot be nested in :monosp:`moving`, and is invisible in a
     :monosp:`shapegroup`. :monosp:`mi.traverse` shows its material and its light, and a placeholder
     in place of its vertices: they cannot be changed after loading.
 
-    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3: complete trees
-    of four children, without pointers, and with four triangles in each leaf. Here, each holds 64
-    triangles; above them, a tree is split by surface areas (I. Wald, *On fast Construction of
-    SAH-based Bounding Volume Hierarchies*, IEEE Symposium on Interactive Ray Tracing, 2007). Boxes
-    are bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient
+    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3: complete trees of
+    four children, without pointers, and with four triangles in each leaf. Here, each tree holds 64
+    triangles; above these trees, a tree is split by surface areas (I. Wald, *On fast Construction
+    of SAH-based Bounding Volume Hierarchies*, IEEE Symposium on Interactive Ray Tracing, 2007).
+    Boxes are bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient
     Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs*, HPG 2017. The test of triangles
     follows S. Woop, C. Benthin, I. Wald, *Watertight Ray/Triangle Intersection*, JCGT 2(1), 2013.
 

@@ -21,30 +21,29 @@ class Moving(mi.Mesh):
     Moving shapes (:monosp:`moving`)
     --------------------------------
 
-    Moves the shapes that are nested in it, rigidly and together, while the shutter is open. The
-    integrators of this package render their motion blur, also in shadows, reflections and indirect
-    light.
+    Moves the nested shapes together, as a rigid body, while the shutter is open. The integrators of
+    this package render their motion blur, including its shadows, reflections and indirect light.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |shape|
-       - The shapes that move, one or more, of any type, with their materials. They rest in their
-         own pose before the motion. Next to an :monosp:`instance`, nest its :monosp:`shapegroup`
-         (or a :monosp:`ref` to it) as well.
+       - The shapes that move, one or more, of any type, with their materials. Before the motion,
+         they rest in their own poses. Together with an :monosp:`instance`, nest its
+         :monosp:`shapegroup` (or a :monosp:`ref` to it) as well.
      * - translate
        - |vector|
        - The total displacement, at constant velocity. (Default: 0, 0, 0)
      * - axis
        - |vector|
-       - The axis about which they turn, at constant speed; it need not be of unit length. (Default:
-         none)
+       - The axis about which they rotate, at constant speed; it need not be of unit length.
+         (Default: none)
      * - angle
        - |float|
        - The total rotation in degrees; it may exceed 360. Required with :monosp:`axis`.
      * - center
        - |point|
-       - A point of the axis, before the motion; it is displaced with the shapes. Accepted only with
+       - A point on the axis, before the motion; it is displaced with the shapes. Accepted only with
          :monosp:`axis`. (Default: 0, 0, 0)
      * - begin, end
        - |float|
@@ -52,53 +51,52 @@ class Moving(mi.Mesh):
          :monosp:`shutter_close`. (Default: 0 and 1)
      * - pose_0, pose_1, …
        - |transform|
-       - In place of the parameters above: rotations and translations through which the shapes
-         pass. They are applied after the shapes' own :monosp:`to_world`. In between, positions of
-         the origin are interpolated linearly, rotations by slerp (the shorter way).
+       - In place of the parameters above: rotations and translations through which the shapes pass.
+         They are applied after the shapes' own :monosp:`to_world`. Between the poses, positions of
+         the origin are interpolated linearly, and rotations by slerp (the shorter way).
      * - time_0, time_1, …
        - |float|
-       - The times of the poses: one for each, in increasing order.
+       - The times of the poses, one for each pose, in increasing order.
 
     **Use it when** something moves or turns visibly between the sensor's :monosp:`shutter_open` and
-    :monosp:`shutter_close`, which must be set: they are both 0 by default, and such a sensor sees
-    the shapes where they are at time 0. Before the motion and after it, the shapes rest at its two
-    ends.
-    **Not when** shapes deform: that is not supported. For a camera that moves, use
+    :monosp:`shutter_close`, which must be set: both are 0 by default, and such a sensor sees the
+    shapes where they are at time 0. Before and after the motion, the shapes rest at its start and
+    end pose. **Not when** shapes deform: that is not supported. For a moving camera, use
     :monosp:`moving_camera`; for lights without a surface, :monosp:`moving_light`.
 
     **Lights.** One of the nested shapes may be an area light, of any type of emitter and shape.
-    Connections sample it in its pose at the time of the path, and MIS weights use the densities of
-    that time. A second light needs a :monosp:`moving` of its own, with the same motion. The choice
-    among lights does not divide it into parts. :monosp:`spatial_lights` has probabilities for each
-    eighth of the shutter interval, and uses the light's positions in it; :monosp:`next_event` =
-    :monosp:`linear` uses the bounds of its whole motion. Integrators that start paths from lights
-    refuse lights that move: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
-    :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional.
+    Connections sample it in its pose at the time of the path, and MIS weights use the densities at
+    that time. A second light needs its own :monosp:`moving`, with the same motion. Methods that
+    divide lights into parts do not divide this light. :monosp:`spatial_lights` has probabilities
+    for each eighth of the shutter interval, and uses the light's positions in it;
+    :monosp:`next_event` = :monosp:`linear` uses the bounds of its whole motion. Integrators that
+    start paths from lights refuse moving lights: :monosp:`bdpt`, :monosp:`light_tracer`,
+    :monosp:`mlt`, and :monosp:`erpt` and :monosp:`pssmlt` if they are bidirectional.
 
     Only integrators of this package render these shapes. **Mitsuba's own**, such as :monosp:`path`
     or :monosp:`aov`, **render the scene without them, and we cannot make them refuse it**
     (connections still sample a light among them, with a wrong weight); use :monosp:`composed_path`,
-    which is :monosp:`path` otherwise.
+    which is otherwise the same as :monosp:`path`.
 
     The parameter :monosp:`aovs` of our integrators evaluates them at the time of each ray, in world
-    space (:monosp:`shape_index` is the number of the nested shape), so that the film gets the mean
-    over the shutter interval. For the values at one time, open and close the shutter at that time.
+    space (:monosp:`shape_index` is the index of the nested shape), so the film receives their mean
+    over the shutter interval. For the values at a single time, open and close the shutter at that
+    time.
 
-    Every motion costs time: its shapes have an acceleration structure of their own, which is
-    traversed by all rays that hit the bounding box of the motion. Compared with the same shapes at
-    rest, one motion took 1.15 to 1.3 times as long and four took 1.3 to 1.6 times (less where boxes
-    are small in the view, more where they fill it). Put shapes that move together into one
-    :monosp:`moving`.
+    Every motion costs time: its shapes have their own acceleration structure, which all rays that
+    hit the bounding box of the motion traverse. Compared with the same shapes at rest, one motion
+    took 1.15 to 1.3 times as long, and four motions 1.3 to 1.6 times (less if the boxes are small
+    in the view, more if they fill it). Put shapes that move together into one :monosp:`moving`.
 
     In :monosp:`cuda_*` variants, our integrators refuse scenes with moving shapes: Dr.Jit traces
     the rays of a kernel in one scene only.
 
-    A nested shape may be nowhere else in the scene. Sensors, and meshes with vertex attributes,
-    cannot be nested, and a medium in moving shapes must be homogeneous. The scene's
+    A nested shape must not appear elsewhere in the scene. Sensors, and meshes with vertex
+    attributes, cannot be nested, and a medium in moving shapes must be homogeneous. The scene's
     bounds include all of the motion. :monosp:`mi.traverse` does not show nested shapes: it shows a
     placeholder mesh in their place. Textures that depend on the position in the world do not move
-    along. An instance of a group that holds a :monosp:`merge` of rectangles
-    may be cut off, as Mitsuba 3.9.1 does not know its bounds.
+    along. An instance of a group that contains a :monosp:`merge` of rectangles may be cut off,
+    because Mitsuba 3.9.1 does not know its bounds.
 
     Source: R. L. Cook, T. Porter, L. Carpenter, *Distributed Ray Tracing*, 1984; K. Shoemake,
     *Animating Rotation with Quaternion Curves*, 1985 (slerp).

@@ -18,24 +18,24 @@ class PortalShape(mi.Mesh):
     --------------------------
 
     Marks a rectangular opening through which the environment lights a room: a window, a door, a
-    skylight. The decision :monosp:`portal_lights` of :class:`composed_path` samples the part of
-    the environment that is seen through it.
+    skylight. The decision :monosp:`portal_lights` of :class:`composed_path` samples the part of the
+    environment that is visible through it.
 
     .. pluginparameters::
 
      * - to_world
        - |transform|
-       - Places the square from (−1, −1, 0) to (1, 1, 0), as that of :monosp:`rectangle`, onto the
-         opening. Its normal (0, 0, 1) must point into the room. It must remain a rectangle.
+       - Places the square from (−1, −1, 0) to (1, 1, 0), the same as for :monosp:`rectangle`, on
+         the opening. Its normal (0, 0, 1) must point into the room. It must remain a rectangle.
          (Default: none, i.e. identity)
 
-    **Use it when** a closed room is lit through it by an :monosp:`envmap`, a :monosp:`sunsky` or a
-    :monosp:`constant` environment. **Not when** the camera is outdoors.
+    **Use it when** an :monosp:`envmap`, a :monosp:`sunsky` or a :monosp:`constant` environment
+    lights a closed room through an opening. **Not when** the camera is outdoors.
 
     It is not a surface: no ray hits it, and it does not change the images of other integrators.
-    Make it as large as the opening, or a little larger: the environment that is seen past its edge
-    is still found, but with few samples. In a thick wall, place it at the outer edge. Panes of
-    glass in the opening block connections to the environment, as always.
+    Make it as large as the opening, or a little larger: the part of the environment that is visible
+    past its edge is still found, but with few samples. In a thick wall, place it at the outer edge.
+    Panes of glass in the opening block connections to the environment, as always.
 
     Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
     Graphics Forum 34(4), 2015.
