@@ -39,7 +39,7 @@ def test_a_tutorial_is_a_short_notebook_with_python_cells(tutorial: Path) -> Non
     compile(script, str(tutorial), "exec")
     assert script.index("import mitsuba_ext") < script.index("import mitsuba as mi")
     assert max(map(len, script.splitlines())) <= 100
-    assert "## Where to go on" in text
+    assert "## Where to go next" in text
 
 
 @pytest.mark.slow
