@@ -79,17 +79,17 @@ class Auto(LightPathIntegrator):
     **Use it when** you do not know which technique a scene needs. **Not when** an image has fewer
     than 16 samples per pixel: there is too little to learn from.
 
-    The first two pilots are those of :class:`auto_path`. A short trial follows, with one light path
-    for each camera path, all techniques, and the lights learned so far. Its samples predict the
-    variance of each choice: no light paths, or 1/16, 1/4, 1 or 4 of them per camera path; 0, 1, 2
-    or 4 connections from each vertex of a camera path to their vertices; with or without merging.
-    Counts of rays predict the time of each choice. The integrator uses the best of these choices if
-    it is better than guided directions and maps. Maps are then dropped. Guided directions that paid
-    before are learned again, from samples with light paths, unless vertices are merged; beside
-    light paths, a guide is expected to keep the square root of its efficiency. The trial has 16384
-    samples, spread over the film, which are not part of the image; in renders of less than a
-    million samples, it has as few as 4096. If light paths reduce the variance to less than 0.4 of
-    its value, the samples before the trial are left out of the image.
+    The first two pilots are the same as in :class:`auto_path`. A short trial follows, with one
+    light path for each camera path, all techniques, and the lights learned so far. Its samples
+    predict the variance of each choice: no light paths, or 1/16, 1/4, 1 or 4 of them per camera
+    path; 0, 1, 2 or 4 connections from each vertex of a camera path to their vertices; with or
+    without merging. Counts of rays predict the time of each choice. The integrator uses the best of
+    these choices if it is better than guided directions and maps. Maps are then dropped. Guided
+    directions that paid before are learned again, from samples with light paths, unless vertices
+    are merged; beside light paths, a guide is expected to keep the square root of its efficiency.
+    The trial has 16384 samples, spread over the film, which are not part of the image; in renders
+    of less than a million samples, it has as few as 4096. If light paths reduce the variance to
+    less than 0.4 of its value, the samples before the trial are left out of the image.
 
     With fewer than 262144 samples, the integrator skips learning and renders as :monosp:`path`
     does, unless it saves or keeps what it learns. Learning, and compiling the kernels that it

@@ -30,9 +30,10 @@ class ComposedPath(WalkIntegrator):
 
      * - directions
        - |string| or |decision|
-       - Which random numbers choose the next direction of a path: :monosp:`uniform` ones,
-         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. With :monosp:`swarm`, maps
-         as in :monosp:`swarm_path` choose between reflection and transmission. (Default: uniform)
+       - Which random numbers choose the next direction of a path: :monosp:`uniform` numbers,
+         :monosp:`guided` numbers, or a nested :monosp:`guided_directions`. With :monosp:`swarm`,
+         maps as in :monosp:`swarm_path` choose between reflection and transmission. (Default:
+         uniform)
      * - scattering
        - |string|
        - What samples the next direction of a path: the :monosp:`bsdf`; with :monosp:`swarm`, also
@@ -54,9 +55,9 @@ class ComposedPath(WalkIntegrator):
      * - light_numbers
        - |string|
        - Which random numbers choose the light and the point on it, at the first vertex that is
-         connected to lights: :monosp:`uniform` ones, or those of learned maps, :monosp:`swarm` (see
-         :monosp:`swarm_path`). It requires a :monosp:`next_event` that does not learn. (Default:
-         uniform)
+         connected to lights: :monosp:`uniform` numbers, or with :monosp:`swarm`, numbers from
+         learned maps (see :monosp:`swarm_path`). It requires a :monosp:`next_event` that does not
+         learn. (Default: uniform)
      * - roulette
        - |string|
        - Which paths Russian roulette continues, from :monosp:`rr_depth` on. :monosp:`throughput` is
@@ -82,15 +83,15 @@ class ComposedPath(WalkIntegrator):
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a
-         camera ray: those of the sensor's :monosp:`sampler`, those of learned maps of film tiles
-         (:monosp:`swarm`, see :monosp:`swarm_path`), those of point sets of a pattern
-         (:monosp:`sobol`, :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`.
-         The slot :monosp:`wavelength` needs a spectral variant. (Default: sampler)
+         camera ray. They come from the sensor's sampler (:monosp:`sampler`), from learned maps of
+         film tiles (:monosp:`swarm`, see :monosp:`swarm_path`), from point sets with a pattern
+         (:monosp:`sobol`, :monosp:`lattice`, …), or from a nested :monosp:`weighted_numbers`. The
+         slot :monosp:`wavelength` needs a spectral variant. (Default: sampler)
      * - distance
        - |string|
-       - Which random numbers choose the distance that a camera ray travels in a homogeneous medium:
-         those of the :monosp:`sampler`, or those of learned maps, :monosp:`swarm` (see
-         :monosp:`swarm_path`). (Default: sampler)
+       - Which random numbers choose the distance that a camera ray travels in a homogeneous medium.
+         They come from the sensor's sampler (:monosp:`sampler`), or from learned maps
+         (:monosp:`swarm`, see :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which decisions learn; at most a quarter of all
@@ -145,11 +146,10 @@ class ComposedPath(WalkIntegrator):
     of its own. :monosp:`neepp`, :monosp:`pss_guided` and :monosp:`reweighted_direct` are this path
     tracer with some of these decisions preset.
 
-    Source: the algorithms are those of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T.
-    Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple
-    importance sampling); P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH
-    2003 course 44, section 3.4 (:monosp:`linear`). The pages of the decisions name their own
-    sources.
+    Source: the algorithms of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T. Kajiya, *The
+    Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling);
+    P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section
+    3.4 (:monosp:`linear`). The pages of the decisions name their own sources.
 
     .. tabs::
         .. code-tab:: xml
