@@ -86,10 +86,10 @@ class Auto(LightPathIntegrator):
     without merging. Counts of rays predict the time of each choice. The integrator uses the best of
     these choices if it is better than guided directions and maps. Maps are then dropped. Guided
     directions that paid before are learned again, from samples with light paths, unless vertices
-    are merged; beside light paths, a guide is expected to keep the square root of its efficiency.
-    The trial has 16384 samples, spread over the film, which are not part of the image; in renders
-    of less than a million samples, it has as few as 4096. If light paths reduce the variance to
-    less than 0.4 of its value, the samples before the trial are left out of the image.
+    are merged; together with light paths, a guide is expected to keep the square root of its
+    efficiency. The trial has 16384 samples, spread over the film, which are not part of the image;
+    in renders of less than a million samples, it has as few as 4096. If light paths reduce the
+    variance to less than 0.4 of its value, the samples before the trial are left out of the image.
 
     With fewer than 262144 samples, the integrator skips learning and renders as :monosp:`path`
     does, unless it saves or keeps what it learns. Learning, and compiling the kernels that it
@@ -112,10 +112,10 @@ class Auto(LightPathIntegrator):
     measurement. (Everything else that is learned is tested in each pilot.)
 
     In scenes with participating media, photons are the only alternative to camera paths. They are
-    rendered as by :class:`sppm`. Renders of two million samples or more try photons on a coarse
-    film, beside camera paths. The photons also show how rarely camera paths find the light of lamps
-    in or behind glass, to which they cannot be connected. If camera paths are kept, the later
-    pilots show their actual variance, with all that was learned for them. If photons would be
+    rendered as in :class:`sppm`. Renders of two million samples or more try photons on a coarse
+    film, in addition to camera paths. The photons also show how rarely camera paths find the light
+    of lamps in or behind glass, to which they cannot be connected. If camera paths are kept, the
+    later pilots show their actual variance, with all that was learned for them. If photons would be
     better, they render the last stage. Once photons are chosen, this choice is not tested again.
 
     Light paths are not tried in films of more than two million pixels, nor if a light cannot emit
@@ -129,9 +129,9 @@ class Auto(LightPathIntegrator):
     Gradients are not supported (use :class:`composed_prb`); neither are scalar and polarized
     variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
-    Sources: the sources of :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I.
-    Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional
-    Rendering Algorithms*, ACM Transactions on Graphics 41(4), 2022.
+    Sources: see :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I. Georgiev, P.
+    Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering
+    Algorithms*, ACM Transactions on Graphics 41(4), 2022.
 
     .. tabs::
         .. code-tab:: xml

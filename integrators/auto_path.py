@@ -60,12 +60,12 @@ class AutoPath(WalkIntegrator):
     :monosp:`swarm_path` are not tried, because guided directions take their place.
     :monosp:`integrator.statistics.learned` says which techniques were kept, and why.
 
-    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
+    Participating media are rendered as in :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
     no pilot samples.
 
-    Sources: the sources of :monosp:`guided_directions`, :monosp:`learned_lights` and
-    :monosp:`swarm_path`. The predictions are ours.
+    Sources: see :monosp:`guided_directions`, :monosp:`learned_lights` and :monosp:`swarm_path`. The
+    predictions are ours.
 
     .. tabs::
         .. code-tab:: xml

@@ -105,7 +105,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     glossy, caustics matter (:class:`vcm`), or light is mostly direct: it is then :monosp:`path` at
     a higher price.
 
-    **Direct light** is sampled as by :monosp:`path`, with its MIS weights; points on lamps are not
+    **Direct light** is sampled as in :monosp:`path`, with its MIS weights; points on lamps are not
     virtual lights. Virtual lights lie where a BSDF has a part that is not a delta distribution;
     light paths pass via mirrors and through clear glass. A camera path is connected at vertices on
     such surfaces, after any chain of mirrors and glass.

@@ -43,7 +43,7 @@ class IrradianceCache(WalkIntegrator):
 
     Computes the irradiance of indirect light and its gradients at a few places on diffuse surfaces,
     from many paths each, and interpolates between these places. Direct light, and everything that
-    is not diffuse, is sampled as by :monosp:`path`.
+    is not diffuse, is sampled as in :monosp:`path`.
 
     .. pluginparameters::
 
@@ -79,7 +79,7 @@ class IrradianceCache(WalkIntegrator):
      * - next_event, shadow_test
        - |string| or decision
        - How lights are chosen; see :class:`composed_path`. The paths from records use them too. If
-         they learn, pilot samples are taken as by :monosp:`path`.
+         they learn, pilot samples are taken as in :monosp:`path`.
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -110,8 +110,8 @@ class IrradianceCache(WalkIntegrator):
     1/ε as in Eq. 10.9, which would show the noise of records; and records overlap by 1.3 times
     their radius.
 
-    Caustics are part of the irradiance, blurred and with the noise of :monosp:`path`: use
-    :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
+    Caustics are part of the irradiance, blurred and with the noise of :monosp:`path`; for caustics,
+    use :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
     mirrors and glass, paths may be longer than :monosp:`max_depth` by the segments before the
     diffuse surface. A :monosp:`timeout` leaves half of the time to the records.
 

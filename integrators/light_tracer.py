@@ -77,7 +77,7 @@ class LightTracerIntegrator(WalkIntegrator):
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
     emitter of a light path is chosen by power for one half of the paths, and by
     :monosp:`sampling_weight` for the other half. Surfaces and sky emit what :monosp:`path` sees,
-    also in cases where Mitsuba's :monosp:`ptracer` is wrong: for turned spheres and environment
+    also in cases where Mitsuba's :monosp:`ptracer` is wrong: for rotated spheres and environment
     maps, lights with interpolated normals, textured lights, merged rectangles, normal and bump
     maps, filters at the film's edges. With the sampler :monosp:`ldsampler`, whose numbers depend on
     each other, light paths draw independent random numbers instead.

@@ -107,7 +107,7 @@ class NEEPlusPlus(WalkIntegrator):
     have learned. If these show that the gain is small, learning ends early, unless :monosp:`grid`,
     :monosp:`rejection` or a map file is given.
 
-    Participating media are rendered as by :monosp:`volpath`; lights are learned for points in media
+    Participating media are rendered as in :monosp:`volpath`; lights are learned for points in media
     as they are for surfaces (:monosp:`light_sampling=linear` refuses media). Gradients are not
     supported (use :class:`composed_prb`); neither are scalar and polarized variants. Nested in
     :monosp:`moment`, it takes no pilot samples.

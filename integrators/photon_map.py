@@ -47,7 +47,7 @@ class PhotonMapping(WalkIntegrator):
 
     Traces photons once, before the render. Camera paths then end early: the light that leaves the
     second diffuse surface of a path, and the caustics that fall on the first, are estimated from
-    nearby photons. Direct light is sampled as by :monosp:`path`.
+    nearby photons. Direct light is sampled as in :monosp:`path`.
 
     .. pluginparameters::
 

@@ -81,7 +81,7 @@ class PSSGuided(WalkIntegrator):
     After a render, :monosp:`integrator.statistics.learned` describes what was learned, and
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
-    Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
+    Participating media are rendered as in :monosp:`volpath`; in them, directions are guided by
     tiles only. Gradients are not supported (use :class:`composed_prb`); neither are scalar and
     polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 

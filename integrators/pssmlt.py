@@ -22,7 +22,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     ------------------------------------------------------------------
 
     Markov chains mutate the random numbers of a bidirectional path tracer (or of :monosp:`path`),
-    and stay longer at numbers with which much light is found.
+    and stay longer at numbers that find much light.
 
     .. pluginparameters::
 

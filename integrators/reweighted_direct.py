@@ -60,7 +60,7 @@ class ReweightedDirect(WalkIntegrator):
     samples reduce its noise more), or with many lights (use :monosp:`neepp`). Compare it with
     :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
-    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
+    Participating media are rendered as in :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`); neither are scalar and polarized variants.
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, which are

@@ -121,7 +121,7 @@ class SwarmPath(WalkIntegrator):
     :monosp:`mitsuba_ext.techniques.swarming.pixel_maps` returns the maps of a pixel as arrays (see
     examples/swarm_maps.py).
 
-    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
+    Participating media are rendered as in :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
     no pilot samples.
 

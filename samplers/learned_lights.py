@@ -59,7 +59,7 @@ class LearnedLightsPlugin(DecisionPlugin):
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
     :monosp:`path` is biased for these lights, because of a fault in Mitsuba. Nested in
-    :monosp:`moment`, the integrator takes no pilot samples, and lights are chosen as by
+    :monosp:`moment`, the integrator takes no pilot samples, and lights are chosen as in
     :monosp:`path`.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for

@@ -24,7 +24,7 @@ class PortalLightsPlugin(DecisionPlugin):
      * - share
        - |float|
        - The share of the connections to the environment that are sampled through portals, 0 to
-         0.99. The other connections are sampled as by :monosp:`path`, and find light that no portal
+         0.99. The other connections are sampled as in :monosp:`path`, and find light that no portal
          shows. (Default: 0.9)
 
     **Use it when** a sky (:monosp:`envmap`, :monosp:`sunsky`, :monosp:`constant`) lights a room
@@ -42,7 +42,7 @@ class PortalLightsPlugin(DecisionPlugin):
 
     The density is exact and known in every direction, so it can be combined with BSDF samples by
     MIS. At points that see no portal from inside, for lights other than the environment, and in
-    scenes without portals or environment, lights are sampled as by :monosp:`path`.
+    scenes without portals or environment, lights are sampled as in :monosp:`path`.
 
     Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
     Graphics Forum 34(4), 2015. The share of ordinary samples is ours.

@@ -32,7 +32,7 @@ class TwoStageLightsPlugin(DecisionPlugin):
      * - vertices
        - |string|
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
-         other vertices, lights are chosen as by :monosp:`path`. (Default: first)
+         other vertices, lights are chosen as in :monosp:`path`. (Default: first)
      * - visibility
        - |string|
        - How connections of first vertices take occlusion into account: not at all
@@ -62,7 +62,7 @@ class TwoStageLightsPlugin(DecisionPlugin):
     the image is unbiased whatever the maps contain. Maps need no correction, and they are not made
     on demand: a map is an array of counters, and every connection still traces its shadow ray.
 
-    Lights other than the environment are sampled as by :monosp:`path`, and so are all lights of a
+    Lights other than the environment are sampled as in :monosp:`path`, and so are all lights of a
     scene without an environment. BSDF samples are combined by MIS; lobes narrower than a texel are
     left to them. The density is positive wherever the map is defined: a hundredth of it follows the
     map alone. The table of the map takes 12 bytes for each of its texels. Not for :monosp:`bdpt`
