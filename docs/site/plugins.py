@@ -52,8 +52,7 @@ def kinds() -> dict[str, list[Path]]:
     found["samplers"] = [file for file in samplers if file.stem not in decisions]
     found["bases"] = [
         file
-        for folder in ("composition", "sequences")
-        for file in sorted((ROOT / "mitsuba_ext" / folder).glob("*.py"))
+        for file in sorted((ROOT / "mitsuba_ext" / "bases").glob("*.py"))
         if _LIST in file.read_text(encoding="utf-8")
     ]
     return found
