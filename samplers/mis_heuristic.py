@@ -12,8 +12,8 @@ class MisHeuristicPlugin(DecisionPlugin):
     r"""
     .. _sampler-mis_heuristic:
 
-    Heuristic of multiple importance sampling (:monosp:`mis_heuristic`)
-    -------------------------------------------------------------------
+    Multiple importance sampling heuristic (:monosp:`mis_heuristic`)
+    ----------------------------------------------------------------
 
     A decision for the slot :monosp:`mis` of :monosp:`composed_path`. Two techniques find the same
     light: connections to it, and BSDF samples that hit it. The heuristic weights both by their
