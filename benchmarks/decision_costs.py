@@ -3,7 +3,7 @@ units of that of ``path``, and for each event in units of a ray.
 
     python benchmarks/decision_costs.py scenes/rooms.xml …
 
-The constants of guided directions in ``mitsuba_ext/planning/benefit.py`` are medians of what this
+The constants of guided directions in ``mitsuba_ext/planning/evidence.py`` are medians of what this
 prints.
 """
 

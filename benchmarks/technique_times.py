@@ -4,7 +4,7 @@ and in brackets as the trial of ``auto`` predicts it.
     python benchmarks/technique_times.py scenes/corridor.xml scenes/keyhole.xml …
 
 The constants of ``mitsuba_ext/estimators/light_paths/choice/light_paths.py``, and ``SEGMENT`` and
-``SHADOW`` of ``mitsuba_ext/planning/benefit.py``, were fitted to what this prints. The machine
+``SHADOW`` of ``mitsuba_ext/planning/evidence.py``, were fitted to what this prints. The machine
 must be idle.
 """
 

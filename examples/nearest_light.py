@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
-from mitsuba_ext.planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from mitsuba_ext.planning.technique import ParameterReader, Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.transport.light_table import LightTable
 from mitsuba_ext.util.arrays import from_numpy
@@ -48,7 +48,7 @@ class NearestLight:
         return nearest
 
 
-class NearestLightParameters(DecisionParameters):
+class NearestLightParameters(Technique):
     """Reads the parameters, and makes the decision for a render.
 
     Attributes:

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
-from mitsuba_ext.planning.decision_parameters import DecisionParameters, ParameterReader, Setting
 from mitsuba_ext.planning.learner import Learner
+from mitsuba_ext.planning.technique import ParameterReader, Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.spectra import brightness
 from mitsuba_ext.transport.light_table import LightTable, OneRow
@@ -65,7 +65,7 @@ class ProvenLights(Learner):
         return f"proven lights: the most likely one has {self._shares.max():.0%} of the choices"
 
 
-class ProvenLightsParameters(DecisionParameters):
+class ProvenLightsParameters(Technique):
     """Makes the learner of a render. There are no parameters to read from the scene."""
 
     name = "proven_lights"

@@ -5,19 +5,16 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
 
 import mitsuba as mi
 
-from mitsuba_ext.bases import light_path_schedule
 from mitsuba_ext.bases.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.bases.learned_slots import learned_slots
-from mitsuba_ext.bases.light_path_schedule import LightPathSchedule
 from mitsuba_ext.bases.staged_integrator import NO_LIMIT
-from mitsuba_ext.bases.walk_integrator import LEARNING_KERNELS
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
 from mitsuba_ext.estimators.light_paths.choice.light_paths import (
-    LightPathsWhereTheyPay,
+    AutoLightPaths,
     LightPathTrial,
 )
 from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonChoice, PhotonTrial
@@ -25,19 +22,22 @@ from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
 from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
+from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
-from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.bsdfs import has_clear_curves
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.estimator import Estimator
+from mitsuba_ext.transport.observer import Observer
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
 
-#: The trial of light paths compiles about so many kernels as large as that of ``path``.
-_TRIAL_KERNELS = 4
+#: Renders of fewer samples learn nothing: the fixed cost of learning exceeds the time that ``path``
+#: needs for the whole image. Compiling its kernels takes ten times as long.
+LEAST_SAMPLES = 1 << 18
 
 
 @registry.plugin
@@ -152,7 +152,6 @@ class Auto(LightPathIntegrator):
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
         self.fill(props, **learned_slots(self.name))
-        self._has_light_paths = self._has_trial = self._has_media = False
 
     @property
     def needs_equal_samples(self) -> str:
@@ -167,68 +166,61 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def pilots(self, scene, sensor, spp, kernels=math.inf):
+    def plan_learning(self, scene, sensor, spp, kernels=math.inf):
         pixel_count = math.prod(film_extent(sensor.film()))
-        least, is_kept = light_path_schedule.LEAST_SAMPLES, self.save_learned or self.keep_learned
-        is_short = pixel_count * spp < least and not is_kept
-        stages = super().pilots(scene, sensor, 0 if is_short else spp, kernels)
-        if is_short and not self.restores:
-            self.too_short = f"nothing: with fewer than {least} samples, it is path"
-        self._has_media = may_have_media(scene)
-        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
-        trial = PhotonTrial if self._has_media else LightPathTrial
-        is_possible = bool(stages) and trial.is_possible(pixel_count, spp)
-        is_possible &= kernels >= LEARNING_KERNELS + _TRIAL_KERNELS
-        self._has_trial = is_possible and self._has_light_paths
-        return stages
+        is_short = pixel_count * spp < LEAST_SAMPLES
+        is_short &= not (self.save_learned or self.keep_learned)
+        plan = super().plan_learning(scene, sensor, 0 if is_short else spp, kernels)
+        if is_short and plan.restore is None:
+            remark = f"nothing: with fewer than {LEAST_SAMPLES} samples, it is path"
+            plan = replace(plan, remark=remark)
+        kind = PhotonTrial if may_have_media(scene) else LightPathTrial
+        tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
+        tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
+        if not (tries or plan.restore) or pixel_count > _MOST_PIXELS or not self._can_try(scene):
+            return plan
+        trial = functools.partial(kind.in_own_stage, sensor.film())
+        return replace(plan, tries=tries, trial=trial)
 
-    def schedule(self, scene, sensor, samples, seed) -> Schedule | LightPathSchedule:
-        schedule = super().schedule(scene, sensor, samples, seed)
-        if not self._has_light_paths or not (self._has_trial or self.restores):
-            return schedule
-        if self._has_media:
-            trial = PhotonTrial(sensor.film(), sum(samples))
-        else:
-            trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
-        if self._has_trial:
-            count = math.prod(film_extent(sensor.film())) * sum(samples)
-            return LightPathSchedule(schedule, scene, len(samples) - 1, trial, count)
-        schedule.beside["light_paths"] = trial
-        return schedule
-
-    def estimators(self, scene, sensor):
-        if not self._has_light_paths or not (self._has_trial or self.restores):
+    def estimators(self, scene, sensor, learning):
+        if learning.trial is None:
             return self.walk
-        if self._has_media:
+        if may_have_media(scene):
             mapper = functools.cache(
                 functools.partial(photon_mapper, self, scene, sensor, self.merging)
             )
             return functools.partial(self._in_media, mapper)
-        return super().estimators(scene, sensor)
+        return super().estimators(scene, sensor, learning)
 
-    def _in_media(self, mapper: Callable[[], PhotonMapper], **decisions: Any) -> Estimator:
-        """The estimator of a stage in a scene with media; ``mapper`` makes that of photons."""
-        choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
-        return choice.estimator(self.walk(**decisions), mapper)
+    def _in_media(
+        self,
+        mapper: Callable[[], PhotonMapper],
+        decisions: Decisions,
+        observer: Observer | None = None,
+    ) -> Estimator:
+        """The estimator of a stage in a scene with media; ``mapper`` makes the one of photons."""
+        choice: PhotonChoice = decisions.light_paths or PhotonChoice()
+        return choice.estimator(self.walk(decisions, observer), mapper)
 
     def parameters(self):
-        learns_from = f"{light_path_schedule.LEAST_SAMPLES} samples (with fewer, it is path)"
+        learns_from = f"{LEAST_SAMPLES} samples (with fewer, it is path)"
         return {**super().parameters(), "learns_from": learns_from}
 
     def merging_radius(self, scene, sensor, side, *sums):
         return super().merging_radius(scene, sensor, side, *sums) if _can_merge(scene) else None
 
     def _can_try(self, scene: mi.Scene) -> bool:
-        """Can camera paths be connected to light paths, in what this integrator does else?"""
+        """Whether light paths can be tried in the scene."""
         if self.max_depth < 2:
             return False
+        has_media = may_have_media(scene)
         # In media there is only merging
-        if self._has_media and not _can_merge(scene):
+        if has_media and not _can_merge(scene):
             return False
-        if not LightPathsWhereTheyPay().can_learn(scene, 1):
+        if not AutoLightPaths().can_learn(scene, 1):
             return False
         # Nor may light pass through curves: merging would have to find it
-        if self._has_media and has_clear_curves(scene):
+        if has_media and has_clear_curves(scene):
             return False
         try:
             LightEmission(scene)

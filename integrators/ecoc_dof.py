@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -15,7 +16,7 @@ from mitsuba_ext.estimators.defocus.pinhole import LensCentre
 from mitsuba_ext.estimators.defocus.thin_lens import ThinLens
 from mitsuba_ext.images.denoising import denoiser
 from mitsuba_ext.rendering.render import render
-from mitsuba_ext.rendering.stages import Schedule, Stage
+from mitsuba_ext.rendering.stages import ChangedSchedule, Schedule, Stage
 from mitsuba_ext.scene.movers import is_moving_camera
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import SceneQuery
@@ -167,13 +168,13 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         finally:
             self._is_rendering = False
 
-    def schedule(self, scene, sensor, samples, seed) -> Schedule:
+    def schedule(self, scene, sensor, samples, seed, learning) -> Schedule:
         if not self._is_rendering:
             raise NotImplementedError(
                 f'"{self.name}": a filter makes its picture: nest the other integrator in it, and '
                 f"not the other way round"
             )
-        return _FromTheMiddle(super().schedule(scene, sensor, samples, seed))
+        return _FromTheMiddle(super().schedule(scene, sensor, samples, seed, learning))
 
     # ---- What the job asks for ----
 
@@ -223,13 +224,8 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         return self.hidden_spp or max(1, spp // 2)
 
 
-class _FromTheMiddle:
+class _FromTheMiddle(ChangedSchedule):
     """A schedule whose camera rays begin in the middle of the lens."""
 
-    def __init__(self, nested: Schedule) -> None:
-        self._nested = nested
-
-    def next_stage(self) -> Stage:
-        stage = self._nested.next_stage()
-        stage.camera.aperture = LensCentre()
-        return stage
+    def changed(self, stage: Stage) -> Stage:
+        return replace(stage, camera=replace(stage.camera, aperture=LensCentre()))

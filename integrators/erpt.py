@@ -176,9 +176,9 @@ class EnergyRedistribution(MetropolisIntegrator):
                     f'not be given where "mutations" is "path"'
                 )
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         if not self.has_paths or self.max_depth <= MOST:
-            return super().schedule(scene, sensor, samples, seed)
+            return super().schedule(scene, sensor, samples, seed, learning)
         return camera_samples(self, self.setting(scene, sensor, samples, seed))
 
     def target(self, setting):

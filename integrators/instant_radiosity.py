@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -35,7 +36,9 @@ from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.estimator import Estimator
+from mitsuba_ext.transport.observer import Observer
 
 #: How virtual lights are chosen; "learned" is a slot of the walk.
 _CHOICES = {
@@ -212,7 +215,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     def sample_cost(self) -> int:
         return max(2, super().sample_cost)
 
-    def estimators(self, scene, sensor):
+    def estimators(self, scene, sensor, learning):
         self._check(scene)
         if not scene.emitters() or self.max_depth < 3:
             return self._walk_alone if self.light_aovs else self.walk
@@ -227,8 +230,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
             picture = PictureOfLights(side.sensor, width * height, width, offset)
         return functools.partial(self._estimator, side, sets, picture)
 
-    def _walk_alone(self, **decisions: Any) -> Estimator:
-        return AllDirect(self.walk(**decisions))
+    def _walk_alone(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
+        return AllDirect(self.walk(decisions, observer))
 
     def _check(self, scene: mi.Scene) -> None:
         """
@@ -243,13 +246,15 @@ class InstantRadiosityIntegrator(WalkIntegrator):
             )
 
     def _estimator(
-        self, side: LightSide, sets: Sets, picture: PictureOfLights | None, **decisions: Any
+        self,
+        side: LightSide,
+        sets: Sets,
+        picture: PictureOfLights | None,
+        decisions: Decisions,
+        observer: Observer | None = None,
     ) -> Estimator:
-        selection = decisions.pop("subpath_selection", None)
-        next_event = side.next_event(decisions.pop("next_event", None))
-        if next_event is not None:
-            decisions["next_event"] = next_event
-        walk = self.walk(**decisions)
+        selection, next_event = decisions.subpath_selection, side.next_event(decisions.next_event)
+        walk = self.walk(replace(decisions, next_event=next_event), observer)
         # Two more segments lead from the last virtual light to the sensor
         light_walk = LightWalk(
             side.emission, self.max_depth - 1, self.rr_depth, query=walk.query

@@ -23,7 +23,9 @@ from mitsuba_ext.planning import learned_file
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.emission import can_be_hit
+from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk
 
 #: The parameters on which records depend.
@@ -187,20 +189,23 @@ class IrradianceCache(WalkIntegrator):
             )
         return super().query(scene)
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         width, height = film_extent(sensor.film())
         self._begin, self._seed = time.perf_counter(), seed
         self._samples = sum(samples) * width * height
         self.records, self.rounds = Records.none(len(mi.Spectrum())), []
-        return super().schedule(scene, sensor, samples, seed)
+        return super().schedule(scene, sensor, samples, seed, learning)
 
-    def estimators(self, scene, sensor):
+    def estimators(self, scene, sensor, learning):
         return functools.partial(self._estimator, scene, sensor)
 
-    def _estimator(self, scene: mi.Scene, sensor: mi.Sensor, **decisions: Any) -> Walk:
-        walk = self.walk(**decisions)
+    def _estimator(
+        self, scene: mi.Scene, sensor: mi.Sensor, decisions: Decisions,
+        observer: Observer | None = None,
+    ) -> Walk:  # fmt: skip
+        walk = self.walk(decisions, observer)
         # Pilots teach decisions that the paths of records then use
-        if "observer" in decisions or self.max_depth < 3 or not scene.emitters():
+        if observer is not None or self.max_depth < 3 or not scene.emitters():
             return walk
         grid = self._cached(scene, sensor, walk)
         return replace(

@@ -103,9 +103,9 @@ class PathMetropolis(ChainIntegrator):
         self.long_chains = LongChains.read(self, props, p_large=0.2)
         self.switches = read_switches(self, props)
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         if self.max_depth <= MOST:
-            return super().schedule(scene, sensor, samples, seed)
+            return super().schedule(scene, sensor, samples, seed, learning)
         return camera_samples(self, self.setting(scene, sensor, samples, seed))
 
     def target(self, setting):

@@ -31,6 +31,8 @@ from mitsuba_ext.estimators.light_paths.photons.photon_phases import (
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.decisions import Decisions
+from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk
 
 #: The names of the maps, in the order in which they are made.
@@ -150,9 +152,9 @@ class PhotonMapping(WalkIntegrator):
             **super().parameters(),
         }
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         self.maps = self._traced(scene, sensor, seed)
-        return super().schedule(scene, sensor, samples, seed)
+        return super().schedule(scene, sensor, samples, seed, learning)
 
     def _traced(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> PhotonMaps:
         query = self.query(scene)
@@ -183,16 +185,18 @@ class PhotonMapping(WalkIntegrator):
                 f'merged; use "sppm" or "vcm"'
             )
 
-    def estimators(self, scene, sensor):
+    def estimators(self, scene, sensor, learning):
         return functools.partial(self._estimator, scene)
 
-    def _estimator(self, scene: mi.Scene, **decisions: Any) -> Walk:
+    def _estimator(
+        self, scene: mi.Scene, decisions: Decisions, observer: Observer | None = None
+    ) -> Walk:
         # Without a final gather, one more segment finds direct light
         last = ENDED if self.final_gather else GATHERS_ON
         if self.guided and self.maps.gathered is not None:
-            decisions["scattering"] = PhotonDirections(self.maps)
+            decisions = replace(decisions, scattering=PhotonDirections(self.maps))
         return replace(
-            self.walk(**decisions), mis=Phases(), rr_depth=0,
+            self.walk(decisions, observer), mis=Phases(), rr_depth=0,
             roulette=EndsWithTheGather(self.rr_depth, last),
             subpaths=PhotonSubpaths(
                 *self.maps.estimates(scene, self.max_depth), self.final_gather

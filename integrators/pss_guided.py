@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.planning.decision_parameters import ParameterReader
+from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner

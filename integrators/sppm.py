@@ -11,13 +11,13 @@ from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.choice.light_paths import MOST_PATHS, check_shared_rays
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import (
     MergingParameters,
-    share_rays,
+    shared_numbers,
 )
 from mitsuba_ext.estimators.light_paths.photons.photon_mapper import most_lanes
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
-from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.decisions import CameraSamples, Decisions
 from mitsuba_ext.transport.path_decisions import NoConnections
 
 
@@ -138,13 +138,12 @@ class ProgressivePhotonMapping(WalkIntegrator):
     def most_lanes(self) -> int:
         return most_lanes(self.light_paths)
 
-    def schedule(self, scene, sensor, samples, seed) -> OneStage:
+    def schedule(self, scene, sensor, samples, seed, learning) -> OneStage:
         if not scene.emitters() or self.max_depth < 2:
-            return OneStage(self.walk(next_event=NoConnections(), query=self.query(scene)))
+            alone = Decisions(next_event=NoConnections(), query=self.query(scene))
+            return OneStage(self.walk(alone))
         check_shared_rays(self.name, scene, self.light_paths)
         mapper = photon_mapper(
             self, scene, sensor, self.merging, self.radius_in_media, self.light_paths
         )
-        camera = CameraSamples()
-        share_rays(camera, scene, seed)
-        return OneStage(mapper, camera)
+        return OneStage(mapper, CameraSamples(**shared_numbers(scene, seed)))

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.planning.decision_parameters import ParameterReader
+from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.two_stage_lights.parameters import TwoStageLights
 from mitsuba_ext.techniques.weighted_points.connections import Connections

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.light_vertices import Layout, bytes_per_vertex
 from ..estimators.light_paths.light_walk import STRIDE, LightWalk
-from ..estimators.light_paths.merging.merging_parameters import MergingParameters, share_rays
+from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers
 from ..estimators.light_paths.merging.merging_radius import MergingRadius
 from ..estimators.light_paths.partial_sums import PartialSums
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
@@ -27,7 +28,9 @@ from ..images import image_files
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
 from ..startup.registry import variant_bound
+from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
+from ..transport.observer import Observer
 from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
 from .slots import BIDIRECTIONAL_SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
@@ -81,7 +84,7 @@ class LightPathIntegrator(WalkIntegrator):
         except NotImplementedError:
             return False
 
-    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
+    def estimators(self, scene, sensor, learning):
         if not scene.emitters() or self.max_depth < 2:
             return self.walk
         side = LightSide.of(self.name, scene, sensor, self.light_image)
@@ -116,31 +119,32 @@ class LightPathIntegrator(WalkIntegrator):
             scene, sensor, light_walk, not self.merges_all, self.samples_before
         )
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         self._radius = None
-        schedule = super().schedule(scene, sensor, samples, seed)
+        schedule = super().schedule(scene, sensor, samples, seed, learning)
         if self._radius is not None and (mi.is_spectral or movers(scene)) and self._radius():
-            share_rays(schedule.camera, scene, seed)
+            schedule.decide(**shared_numbers(scene, seed))
         return schedule
 
     def _estimator(
-        self, side: LightSide, radius_of: Callable[..., MergingRadius | None], **decisions: Any
+        self,
+        side: LightSide,
+        radius_of: Callable[..., MergingRadius | None],
+        decisions: Decisions,
+        observer: Observer | None = None,
     ) -> Estimator:
         always = LightPathChoice(self.techniques_by_default, self.techniques)
-        choice: LightPathChoice = decisions.pop("light_paths", always)
+        choice: LightPathChoice = decisions.light_paths or always
         techniques = choice.techniques
         are_traced = techniques.light_paths > 0
-        selection = decisions.pop("subpath_selection", SubpathSelection())
-        next_event = decisions.pop("next_event", None)
+        next_event = decisions.next_event
         if not self.sample_direct:
             next_event = NoConnections()
         elif are_traced:
             next_event = side.next_event(next_event)
         else:
             next_event = next_event or side.correct
-        if next_event:
-            decisions["next_event"] = next_event
-        walk = self.walk(**decisions)
+        walk = self.walk(replace(decisions, next_event=next_event), observer)
         if not are_traced:
             return walk
         radius = None
@@ -151,7 +155,7 @@ class LightPathIntegrator(WalkIntegrator):
             radius = radius.of_coarse_film(choice.pixel_width)
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, self.connections * techniques.connections,
-            selection, choice.observer, radius=radius,
+            decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
             merges_all=self.merges_all, light_paths=techniques.light_paths,
             most_lanes=_most_lanes(techniques.light_paths),
         )  # fmt: skip

@@ -17,15 +17,17 @@ from ..estimators.chains.chain_file import ChainFile
 from ..estimators.chains.path_target import PathTarget
 from ..estimators.chains.render import ChainRender
 from ..estimators.chains.target import ImageTarget
-from ..planning.decision_parameters import Setting
+from ..planning.technique import Setting, decisions_of
 from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt, interrupted
 from ..rendering.stages import OneStage
 from ..startup.registry import variant_bound
+from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import with_recordings
+from ..transport.path_decisions import Weights
 from ..transport.walk import Walk
 from ..util.parameters import MOST_SPP
 from .walk_integrator import WalkIntegrator
@@ -142,7 +144,7 @@ class ChainIntegrator(WalkIntegrator):
         """Do camera samples find direct light?"""
         return self.direct_samples >= 0
 
-    def schedule(self, scene, sensor, samples, seed) -> OneStage:
+    def schedule(self, scene, sensor, samples, seed, learning) -> OneStage:
         """The stage of the camera samples."""
         setting = self.setting(scene, sensor, samples, seed)
         if self.finds_direct:
@@ -157,13 +159,12 @@ class ChainIntegrator(WalkIntegrator):
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), 0, self.timeout > 0
         )
 
-    def composed_walk(self, setting: Setting, max_depth: int, **decisions: Any) -> Walk:
-        """A walk with this integrator's decisions; ``decisions`` fill the slots that it leaves to
-        Mitsuba's choice."""
-        chosen = {slot: p.decision(setting) for slot, p in self.slots.items()}
-        decisions.update({slot: decision for slot, decision in chosen.items() if decision})
-        return replace(self.walk(query=self.query(setting.scene), **decisions),
-                       max_depth=max_depth)
+    def composed_walk(
+        self, setting: Setting, max_depth: int, mis: Weights | None = None
+    ) -> Walk:
+        """A walk with this integrator's decisions, and these MIS weights where it has none."""
+        given = Decisions(query=self.query(setting.scene), mis=mis)
+        return replace(self.walk(decisions_of(self.slots, setting, given)), max_depth=max_depth)
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         start = time.perf_counter()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..planning.decision_parameters import DecisionParameters, ParameterReader
+from ..planning.technique import ParameterReader, Technique
 from ..startup.registry import variant_bound
 
 
@@ -21,21 +21,21 @@ class DecisionPlugin(mi.Sampler):
         decision_parameters: The parameters that were read.
     """
 
-    kind: type[DecisionParameters]
+    kind: type[Technique]
 
     def __init__(self, props: mi.Properties) -> None:
         # The base class reads no parameters, as those that it accepts have no effect here
         super().__init__(mi.Properties("independent"))
         self.name = props.plugin_name()
-        self.decision_parameters = self.kind(ParameterReader(self.name, props))
+        self.technique = self.kind(ParameterReader(self.name, props))
 
     def to_string(self) -> str:
-        values = self.decision_parameters.parameters().items()
+        values = self.technique.parameters().items()
         lines = ",\n".join(f"  {key} = {value}" for key, value in values)
         return f"{self.name}[\n{lines}\n]"
 
     def _refuse(self, *_arguments):
-        slots = " or ".join(f'"{slot}"' for slot in self.decision_parameters.slots)
+        slots = " or ".join(f'"{slot}"' for slot in self.technique.slots)
         raise RuntimeError(
             f'"{self.name}" is not a sampler for sensors: nest it in a "composed_path", as {slots}.'
         )

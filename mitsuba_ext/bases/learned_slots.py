@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..planning.decision_parameters import DecisionParameters, ParameterReader
+from ..planning.technique import ParameterReader, Technique
 from ..techniques.guided_directions.parameters import Guided
 from ..techniques.guided_directions.roulette_parameters import GuidedRoulette
 from ..techniques.learned_lights.parameters import LearnedLights
@@ -12,7 +12,7 @@ from ..techniques.swarming.parameters import MAPS
 CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
-def learned_slots(plugin: str) -> dict[str, DecisionParameters]:
+def learned_slots(plugin: str) -> dict[str, Technique]:
     """All that is tried, by slot, with its defaults."""
     read = ParameterReader.of_defaults(plugin)
     return {

@@ -13,7 +13,7 @@ import mitsuba as mi
 from ..estimators.chains.target import ImageTarget
 from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
-from ..planning.decision_parameters import DecisionParameters, Setting
+from ..planning.technique import Setting, Technique
 from ..startup.registry import variant_bound
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths
@@ -49,7 +49,7 @@ class MetropolisIntegrator(ChainIntegrator):
         self.bidirectional = self.parameter(props, "bidirectional", self.is_bidirectional)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
-    def _unlearned(self, props: mi.Properties, slot: str) -> DecisionParameters | None:
+    def _unlearned(self, props: mi.Properties, slot: str) -> Technique | None:
         parameters = read_slot(self.name, props, slot)
         if parameters is not None and parameters.pilot_spp:
             raise ValueError(

@@ -10,7 +10,7 @@ from ..estimators.chains.path_space.mutations import Mutations, Switches
 from ..estimators.chains.path_space.space import PathSpace
 from ..estimators.chains.path_target import PathTarget
 from ..estimators.light_paths.light_side import LightSide
-from ..planning.decision_parameters import Setting
+from ..planning.technique import Setting
 from ..rendering.stages import OneStage
 from ..scene.bsdfs import refuse_clear_curves
 from ..transport.path_decisions import Weights

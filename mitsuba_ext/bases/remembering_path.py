@@ -10,15 +10,16 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..planning.decision_parameters import Setting
+from ..planning.planner import LearningPlan, Planner
+from ..planning.technique import Setting, decisions_of
 from ..rendering.stages import OneStage
 from ..scene.mark import SceneMark
 from ..scene.media import refuse_media
 from ..scene.movers import movers
 from ..startup.registry import variant_bound
+from ..transport.decisions import Decisions
 from ..transport.heroes import disperses
 from ..transport.walk import Walk
-from .schedule import Schedule
 from .slots import SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
 
@@ -35,12 +36,12 @@ class _Remembered:
 
     Attributes:
         scene: The scene that was rendered.
-        decisions: The decisions of the last stage that differ from those of ``path``, by slot.
+        decisions: The decisions of the last stage.
         said: ``learned`` and ``effects`` of the statistics.
     """
 
     def __init__(
-        self, scene: SceneMark, decisions: dict[str, Any], said: tuple[str, dict[str, Any]]
+        self, scene: SceneMark, decisions: Decisions, said: tuple[str, dict[str, Any]]
     ) -> None:
         self.scene, self.decisions, self.said = scene, decisions, said
 
@@ -66,7 +67,7 @@ class RememberingPath(WalkIntegrator):
         if self.can_learn:
             self.learn_every = self.parameter(props, "learn_every", 16, minimum=0)
         self._remembered: _Remembered | None = None
-        self._schedule: Schedule | None = None
+        self._schedule: Planner | None = None
         self._renders = 0
 
     def parameters(self) -> dict[str, Any]:
@@ -87,10 +88,11 @@ class RememberingPath(WalkIntegrator):
         """The walk of the last stage of the last render of ``scene``. If there was none, decisions
         that learn fall back to their defaults."""
         if self._knows(scene):
-            return self.walk(**self._remembered.decisions)
-        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
-        decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
-        return self.walk(query=self.query(scene), **{s: d for s, d in decisions.items() if d})
+            return self.walk(self._remembered.decisions)
+        setting = Setting(
+            scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
+        )
+        return self.walk(decisions_of(self.slots, setting, Decisions(query=self.query(scene))))
 
     def _knows(self, scene: mi.Scene) -> bool:
         # Decisions that do not learn are made again: what they depend on may have changed
@@ -101,23 +103,23 @@ class RememberingPath(WalkIntegrator):
         """Is what it has learned too old?"""
         return 0 < self.learn_every <= self._renders
 
-    def pilots(self, scene, sensor, spp, kernels=math.inf):
+    def plan_learning(self, scene, sensor, spp, kernels=math.inf):
         if self.is_due:
             self.forget()
         if self._knows(scene):
-            return []
+            return LearningPlan()
         # Many renders use what this one learns: pilots have up to three quarters of its samples
-        return super().pilots(scene, sensor, 3 * spp, kernels)
+        return super().plan_learning(scene, sensor, 3 * spp, kernels)
 
     def pace_stage(self, scene, sensor, spp):
         # Its pilots are worth their time in later renders
         return None
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         self._renders += 1
         if self._knows(scene):
-            return OneStage(self.walk(**self._remembered.decisions))
-        self._schedule, self._renders = super().schedule(scene, sensor, samples, seed), 1
+            return OneStage(self.walk(self._remembered.decisions))
+        self._schedule, self._renders = super().schedule(scene, sensor, samples, seed, learning), 1
         return self._schedule
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
@@ -125,8 +127,7 @@ class RememberingPath(WalkIntegrator):
         image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
         if self._schedule is not None and not self.statistics.interrupted:
             said = self.statistics.learned, self.statistics.effects
-            decisions = dict(self._schedule.decisions)
-            self._remembered = _Remembered(SceneMark(scene), decisions, said)
+            self._remembered = _Remembered(SceneMark(scene), self._schedule.decisions, said)
         elif self._knows(scene):
             self.statistics.learned, self.statistics.effects = self._remembered.said
         self._schedule = None

@@ -5,12 +5,14 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
 
-from ..planning.decision_parameters import ParameterReader, Setting
-from ..rendering.stages import Schedule, Stage
+from ..planning.technique import ParameterReader, Setting
+from ..rendering.plan import Learning
+from ..rendering.stages import ChangedSchedule, Schedule, Stage
 from ..startup.registry import variant_bound
 from ..techniques.weighted_points.camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
 from ..techniques.weighted_points.pixel_sets import PixelSets
@@ -79,13 +81,15 @@ class ReweightedCamera(WrappingIntegrator):
         return "its sets of numbers belong together"
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Schedule:
-        schedule = super().schedule(scene, sensor, samples, seed)
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
+        learning: Learning,
+    ) -> Schedule:  # fmt: skip
+        schedule = super().schedule(scene, sensor, samples, seed, learning)
         setting = Setting(
-            scene, sensor, seed, NO_LIMIT, NO_LIMIT, sum(samples), is_timed=self.timeout > 0
-        )
-        numbers = self.numbers.numbers(self.name, self.purpose, setting)
+            scene, sensor, seed, NO_LIMIT, NO_LIMIT, sum(samples), is_timed=self.timeout > 0,
+            plugin=self.name, slot=self.purpose,
+        )  # fmt: skip
+        numbers = self.numbers.decision(setting)
         return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule
 
     def parameters(self) -> dict[str, Any]:
@@ -99,20 +103,20 @@ def _purposes(integrator: mi.Integrator) -> list[str]:
     return own + (_purposes(nested) if nested is not None else [])
 
 
-class _Reweighted:
+class _Reweighted(ChangedSchedule):
     """A schedule whose camera rays take some numbers from weighted sets.
 
     Parameters:
-        nested: The schedule that makes the stages.
+        inner: The schedule that makes the stages.
         purpose: What the numbers choose: an attribute of :class:`CameraSamples`.
         numbers: The numbers.
     """
 
-    def __init__(self, nested: Schedule, purpose: str, numbers: PixelSets) -> None:
-        self._nested, self._purpose, self._numbers = nested, purpose, numbers
+    def __init__(self, inner: Schedule, purpose: str, numbers: PixelSets) -> None:
+        super().__init__(inner)
+        self._numbers = {purpose: numbers}
 
-    def next_stage(self) -> Stage:
-        stage = self._nested.next_stage()
-        if not stage.is_scout:
-            setattr(stage.camera, self._purpose, self._numbers)
-        return stage
+    def changed(self, stage: Stage) -> Stage:
+        if stage.is_scout:
+            return stage
+        return replace(stage, camera=replace(stage.camera, **self._numbers))

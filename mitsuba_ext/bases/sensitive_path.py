@@ -6,15 +6,19 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..planning.planner import LearningPlan
 from ..scene.gradients import Optimized
 from ..scene.mark import SceneMark
 from ..startup.registry import variant_bound
+from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
+from ..transport.observer import Observer
 from ..transport.path_decisions import Weights
 from ..transport.sensitivity import Sensitivity
 from .remembering_path import RememberingPath
@@ -72,9 +76,11 @@ class SensitivePath(RememberingPath):
         with dr.suspend_grad():
             self.render_once(scene, sensor, seed, max(4, samples), False, True)
 
-    def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
-        def sensitive(**decisions: Any) -> Estimator:
-            weights = decisions.pop("mis", None) or Weights()
-            return self.walk(mis=Sensitivity(weights, self._optimized), **decisions)
+    def estimators(
+        self, scene: mi.Scene, sensor: mi.Sensor, learning: LearningPlan
+    ) -> Callable[[Decisions, Observer | None], Estimator]:
+        def sensitive(decisions: Decisions, observer: Observer | None = None) -> Estimator:
+            weights = Sensitivity(decisions.mis or Weights(), self._optimized)
+            return self.walk(replace(decisions, mis=weights), observer)
 
         return sensitive

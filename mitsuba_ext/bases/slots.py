@@ -8,11 +8,11 @@ import mitsuba as mi
 
 from ..estimators.light_paths.choice.light_paths import (
     MOST_PATHS,
+    AutoLightPaths,
     LightPathCount,
-    LightPathsWhereTheyPay,
 )
 from ..estimators.light_paths.subpath_choice.parameters import LearnedSubpaths
-from ..planning.decision_parameters import DecisionParameters, ParameterReader
+from ..planning.technique import ParameterReader, Technique
 from ..techniques.guided_directions.parameters import Guided
 from ..techniques.guided_directions.roulette_parameters import GuidedRoulette
 from ..techniques.learned_lights.parameters import LearnedLights
@@ -29,7 +29,7 @@ from ..techniques.weighted_points.connections import Connections
 from ..util.errors import did_you_mean
 from ..util.pointsets import PATTERNS
 
-_Maker = Callable[[ParameterReader], DecisionParameters]
+_Maker = Callable[[ParameterReader], Technique]
 
 #: Ways to choose a light, and what reads the parameters of each; ``None`` for that of ``path``.
 METHODS: dict[str, _Maker | None] = {
@@ -67,19 +67,19 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
 #: The slots that only bidirectional integrators have. They also have some of :data:`SLOTS`.
 BIDIRECTIONAL_SLOTS: dict[str, dict[str, _Maker | None]] = {
     "subpath_selection": {"uniform": None, "visibility": lambda read: LearnedSubpaths()},
-    "light_paths": {"always": None, "auto": lambda read: LightPathsWhereTheyPay()},
+    "light_paths": {"always": None, "auto": lambda read: AutoLightPaths()},
 }
 
 _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
 #: The plugins of this package that can be nested into a slot.
-_PLUGINS: tuple[type[DecisionParameters], ...] = (
+_PLUGINS: tuple[type[Technique], ...] = (
     Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, PortalLights,
     Connections, MisHeuristic, RejectedShadowRays, WeightedNumbers,
 )  # fmt: skip
 
 
-def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameters | None:
+def read_slot(plugin: str, props: mi.Properties, slot: str) -> Technique | None:
     """Reads what the scene puts into a slot: a word, or a nested plugin; for ``connections`` and
     ``light_paths`` also a number. ``None`` for what ``path`` does.
 
@@ -88,7 +88,7 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
     """
     words = _ALL_SLOTS[slot]
     value = props.get(slot, next(iter(words)))
-    parameters = getattr(value, "decision_parameters", None)
+    parameters = getattr(value, "technique", None)
     if parameters is not None:
         parameters.check_slot(plugin, slot)
         return parameters

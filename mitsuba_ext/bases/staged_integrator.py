@@ -19,6 +19,7 @@ from ..long_renders.intervals import Interval
 from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.interrupts import interrupted
+from ..rendering.plan import Learning
 from ..rendering.stages import Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
@@ -89,12 +90,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- What a subclass overrides ----
 
-    def pilots(
+    def plan_learning(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
-    ) -> list[int]:
-        """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns. See
-        :class:`mitsuba_ext.rendering.plan.Planned`."""
-        return []
+    ) -> Learning:
+        """See :class:`mitsuba_ext.rendering.plan.Planned`."""
+        return Learning()
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
         """See :class:`mitsuba_ext.rendering.render.Staged`."""
@@ -128,8 +128,9 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return 0
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Schedule:
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
+        learning: Learning,
+    ) -> Schedule:  # fmt: skip
         """Makes one stage for each entry of ``samples`` (samples per pixel): pilots, and the last
         one."""
         raise NotImplementedError

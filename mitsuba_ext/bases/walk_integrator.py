@@ -15,30 +15,27 @@ import mitsuba as mi
 import numpy as np
 
 from ..planning import kept_learning, learned_file
-from ..planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ..planning.costs import LEARNING_KERNELS
 from ..planning.learner import Learner
+from ..planning.pilots import pilot_samples, stage_weights
+from ..planning.planner import LearningPlan, Planner
+from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
 from ..rendering.stages import Stage
 from ..scene.aovs import check_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
-from ..techniques.swarming.parameters import Swarm, stage_weights
-from ..techniques.weighted_points.camera_numbers import WeightedNumbers, samples_per_set
+from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
-from ..transport.path_decisions import EmitterSampling, SceneQuery
+from ..transport.observer import Observer
+from ..transport.path_decisions import SceneQuery
 from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
 from ..util.errors import InputError
-from ..util.stored_arrays import StoredArrays
-from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
-
-#: A render that learns compiles about so many kernels as large as that of ``path``: those of its
-#: pilots, and that of the last stage, are larger, and there are many small ones.
-LEARNING_KERNELS = 6
 
 #: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
 _LEAST_SPP = 4
@@ -78,7 +75,7 @@ class WalkIntegrator(StagedIntegrator):
         has_light_paths (bool): Does it trace light paths besides camera paths?
         sees_media (bool): Does it render participating media? If not, it refuses them.
         light_paths_see_media (bool): Do its light paths, if it has any, scatter in them?
-        slots (dict[str, DecisionParameters]): What fills the slots of the walk.
+        slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
     """
 
@@ -92,14 +89,11 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.aovs = self.parameter(props, "aovs", "")
         self._aovs = self._aov_integrator(self.aovs)
-        self.slots: dict[str, DecisionParameters] = {}
+        self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
-        #: Says why the last render learned nothing, if it was too short.
-        self.too_short = ""
         self.save_learned = self.load_learned = ""
         self.keep_learned = False
-        self._kept: kept_learning.Kept | None = None
 
     # ---- What a subclass calls ----
 
@@ -110,7 +104,7 @@ class WalkIntegrator(StagedIntegrator):
         integrator's names where they differ, ``defaults`` the integrator's own defaults."""
         return ParameterReader(self.name, props, names, **defaults)
 
-    def fill(self, props: mi.Properties, **slots: DecisionParameters | None) -> None:
+    def fill(self, props: mi.Properties, **slots: Technique | None) -> None:
         """Fills slots of the walk; ``None`` leaves a slot to Mitsuba's choice. If a decision
         learns, reads the common parameters ``pilot_spp``, ``save_learned``, ``load_learned`` and
         ``keep_learned``.
@@ -169,41 +163,34 @@ class WalkIntegrator(StagedIntegrator):
         """Do ``save_learned`` and ``load_learned`` have an effect?"""
         return bool(self._pilot_spp)
 
-    @property
-    def restores(self) -> bool:
-        """Does the render that :meth:`pilots` has planned use what an earlier one has learned?"""
-        return bool(self.load_learned or self._kept)
-
-    def pilots(
+    def plan_learning(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
-    ) -> list[int]:
-        self.learners, self._kept = {}, None
+    ) -> LearningPlan:
         if self.save_learned:
             self.check_target("save_learned", self.save_learned)
-        self.too_short = ""
-        if self.max_depth < 2 or self.load_learned:
-            return []
+        if self.load_learned:
+            return LearningPlan(restore=functools.partial(self._loaded, scene, sensor))
+        if self.max_depth < 2:
+            return LearningPlan()
         pixel_count = math.prod(film_extent(sensor.film()))
         pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
         if self.keep_learned:
             kept = kept_learning.find(scene, self._learned_by(sensor))
             if kept is not None and sum(pilots) <= kept.pilot_spp:
-                self._kept = kept
-                return []
+                return LearningPlan(restore=kept.arrays)
         if kernels < LEARNING_KERNELS:
-            self.too_short = "nothing: the time limit is too short"
-            return []
-        if self._pilot_spp and spp < _LEAST_SPP:
-            self.too_short = f"nothing: {spp} spp are too few"
-        return pilots
+            return LearningPlan(remark="nothing: the time limit is too short")
+        is_short = self._pilot_spp and spp < _LEAST_SPP
+        remark = f"nothing: {spp} spp are too few" if is_short else ""
+        return LearningPlan(tuple(pilots), remark)
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
         if self.has_light_paths:
             # Camera paths alone would miss the light of some lights, and are much faster
             return None
         # Where maps help much, samples without them are worth less
-        swarms = any(isinstance(p, Swarm) and p.can_learn(scene, 1) for p in self.slots.values())
-        weight = stage_weights((1, spp - 1))[0] if swarms else 1.0
+        doubles = any(t.doubles and t.can_learn(scene, 1) for t in self.slots.values())
+        weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(scene)
         )
@@ -214,34 +201,34 @@ class WalkIntegrator(StagedIntegrator):
         return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
 
     def samples_per_set(self, spp: int) -> int:
-        is_needed = any(isinstance(p, WeightedNumbers) for p in self.slots.values())
-        return samples_per_set(spp, self.timeout > 0) if is_needed else 1
+        is_timed = self.timeout > 0
+        return max((t.samples_per_set(spp, is_timed) for t in self.slots.values()), default=1)
 
     @property
     def needs_equal_samples(self) -> str:
-        for slot, parameters in self.slots.items():
-            if isinstance(parameters, WeightedNumbers):
-                return f'the sets of numbers of "{slot}" belong together: leave the parameter out'
+        for slot, technique in self.slots.items():
+            if technique.needs_equal_samples:
+                return technique.needs_equal_samples.format(slot=slot)
         return ""
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Schedule:
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
+        learning: LearningPlan,
+    ) -> Planner:  # fmt: skip
         *pilots, _rest = samples
-        # A loaded state needs no pilots, but learners to restore it: these need a pilot_spp > 0
-        pilot_spp = self._pilot_spp or 0 if self.restores else sum(pilots)
+        # A restored state needs no pilots, but learners to restore it: these need a pilot_spp > 0
+        pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 0
         setting = Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
-            self.timeout > 0,
+            self.timeout > 0, self.name,
         )  # fmt: skip
-        schedule = Schedule(
-            self.name, self.slots, setting, samples, self.estimators(scene, sensor),
-            self.query(scene), self._restored(scene, sensor),
+        planner = Planner(
+            self.slots, setting, samples, self.estimators(scene, sensor, learning),
+            Decisions(query=self.query(scene)), learning,
             self._savers(scene, sensor, sum(pilots)),
         )  # fmt: skip
-        schedule.remark = self.too_short
-        self.learners = schedule.learners
-        return schedule
+        self.learners = planner.learners
+        return planner
 
     def _learned_by(self, sensor: mi.Sensor) -> str:
         """On what, besides the scene, learned states depend."""
@@ -250,15 +237,11 @@ class WalkIntegrator(StagedIntegrator):
         width, height = film_extent(sensor.film())
         return ", ".join([*slots, f"film = {width}x{height}"])
 
-    def _restored(self, scene: mi.Scene, sensor: mi.Sensor) -> learned_file.States | None:
-        """What an earlier render has learned; ``None`` if this one learns."""
-        if self.load_learned:
-            where = f'"{self.name}": the parameter "load_learned"'
-            path = Path(self.load_learned)
-            return learned_file.load(path, scene, self._learned_by(sensor), where)
-        if self._kept is None:
-            return None
-        return {slot: StoredArrays.of(state) for slot, state in self._kept.states.items()}
+    def _loaded(self, scene: mi.Scene, sensor: mi.Sensor) -> learned_file.States:
+        where = f'"{self.name}": the parameter "load_learned"'
+        return learned_file.load(
+            Path(self.load_learned), scene, self._learned_by(sensor), where
+        )
 
     def _savers(
         self, scene: mi.Scene, sensor: mi.Sensor, pilot_spp: int
@@ -272,18 +255,20 @@ class WalkIntegrator(StagedIntegrator):
             savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
         return savers
 
-    def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
-        """The function that makes the estimator of a stage from its decisions: :meth:`walk`."""
+    def estimators(
+        self, scene: mi.Scene, sensor: mi.Sensor, learning: LearningPlan
+    ) -> Callable[[Decisions, Observer | None], Estimator]:
+        """The function that makes the estimator of a stage: :meth:`walk`."""
         return self.walk
 
-    def walk(self, **decisions: Any) -> Walk:
-        """A walk with this integrator's parameters and the given decisions. If ``light_numbers`` is
-        among them, it warps the primary samples of ``next_event``."""
-        light_numbers = decisions.pop("light_numbers", None)
-        if light_numbers is not None:
-            inner = decisions.get("next_event", EmitterSampling())
-            decisions["next_event"] = light_numbers.around(inner)
-        return Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
+    def walk(
+        self, decisions: Decisions = Decisions(), observer: Observer | None = None  # noqa: B008
+    ) -> Walk:
+        """A walk with this integrator's parameters and these decisions."""
+        observed = {} if observer is None else {"observer": observer}
+        return Walk(
+            self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed
+        )
 
     # ---- What Mitsuba calls ----
 
@@ -302,10 +287,10 @@ class WalkIntegrator(StagedIntegrator):
                 f'"variance" can hold it, and it has a parameter "aovs" of its own'
             )
         self.check_sampled()
-        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
-        decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
-        decisions = {slot: decision for slot, decision in decisions.items() if decision}
-        walk = self.walk(query=self.query(scene), **decisions)
+        setting = Setting(
+            scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
+        )
+        walk = self.walk(decisions_of(self.slots, setting, Decisions(query=self.query(scene))))
         sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 

@@ -9,7 +9,8 @@ import math
 
 import mitsuba as mi
 
-from ..rendering.stages import OneStage, Schedule
+from ..rendering.plan import Learning
+from ..rendering.stages import OneStage, Schedule, Stage
 from ..scene.nesting import refuse_checkpoint
 from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
@@ -66,10 +67,15 @@ class WrappingIntegrator(StagedIntegrator):
 
     # ---- What the base class calls ----
 
-    def pilots(
+    def plan_learning(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
-    ) -> list[int]:
-        return self.nested.pilots(scene, sensor, spp, kernels) if self._is_staged else []
+    ) -> Learning:
+        if not self._is_staged:
+            return Learning()
+        return self.nested.plan_learning(scene, sensor, spp, kernels)
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        return self.nested.pace_stage(scene, sensor, spp) if self._is_staged else None
 
     @property
     def sample_cost(self) -> int:
@@ -84,12 +90,13 @@ class WrappingIntegrator(StagedIntegrator):
         return self.nested.needs_equal_samples if self._is_staged else ""
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Schedule:
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
+        learning: Learning,
+    ) -> Schedule:  # fmt: skip
         if self._is_staged:
             # The size of point sets depends on the timeout, and must be the same for all of them
             self.nested.timeout = self.timeout
-            return self.nested.schedule(scene, sensor, samples, seed)
+            return self.nested.schedule(scene, sensor, samples, seed, learning)
         check_all_is_seen(self.nested, scene)
         return OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
 

@@ -18,7 +18,7 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
     import mitsuba as mi
 
     from ..rendering import camera
-    from ..rendering.camera_samples import CameraSamples
+    from ..transport.decisions import CameraSamples
 
     if not isinstance(integrator, mi.SamplingIntegrator):
         return None

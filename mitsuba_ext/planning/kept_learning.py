@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..scene.fingerprint import fingerprint
+from ..util.stored_arrays import StoredArrays
 
 #: The most renders of which this is kept.
 _MOST = 4
@@ -27,6 +28,10 @@ class Kept(NamedTuple):
 
     states: Mapping[str, Mapping[str, np.ndarray]]
     pilot_spp: int
+
+    def arrays(self) -> dict[str, StoredArrays]:
+        """The states, as a file has them."""
+        return {slot: StoredArrays.of(state) for slot, state in self.states.items()}
 
 
 _kept: OrderedDict[tuple[str, str], Kept] = OrderedDict()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -9,23 +11,49 @@ import numpy as np
 
 from ..transport.observer import Observer
 from ..util.stored_arrays import StoredArrays
-from .effect import Effect
+from . import verdicts
+from .prediction import Effect, Prediction
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A pilot whose samples a learner has observed.
+
+    Attributes:
+        scene: The scene.
+        is_last: Whether the next stage is the last one.
+        judge: Says whether a decision is worth its time.
+    """
+
+    scene: mi.Scene
+    is_last: bool
+    judge: Callable[[Prediction, bool], bool] = verdicts.pays
+
+    def pays(self, prediction: Prediction) -> bool:
+        """Whether a decision is worth its time; in a trial, whether it may be with more samples."""
+        return self.judge(prediction, self.is_last)
 
 
 class Learner(Observer):
-    """Learns one decision of the walk in pilot stages. One object serves one render."""
+    """Learns one decision in pilot stages. One object serves one render. It measures and predicts;
+    whether a decision pays is for the planner to say (:meth:`Pilot.pays`).
 
-    #: Does :meth:`start` need to know where paths scatter?
+    In what follows, ``None`` stands for the decision of Mitsuba's ``path``.
+    """
+
+    #: Whether :meth:`start` needs to know where paths scatter.
     wants_scout = False
 
+    #: Whether it learns which lights a vertex sees (:meth:`shadow_test`).
+    tells_visibility = False
+
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
-        """The decision of the first pilot; ``None`` keeps the current one. ``p``, ``n``: vertices
-        and normals that the scout has found, empty if no learner wants one."""
+        """The decision of the first pilot. ``p``, ``n``: vertices and normals that the scout has
+        found, empty if no learner wants one."""
         raise NotImplementedError
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> Any | None:
-        """The decision of the next stage, which is the last one if ``is_last``; ``None`` keeps the
-        current one."""
+    def learn(self, pilot: Pilot) -> Any | None:
+        """The decision of the next stage."""
         raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
@@ -46,6 +74,46 @@ class Learner(Observer):
         """What is known about the decision of the last stage; ``None`` if nothing was tried, or if
         the effect is part of that of another learner."""
         return None
+
+    def shadow_test(self, law: Any) -> Learner:
+        """A learner of a shadow test from the visibility that this one learns.
+
+        Parameters:
+            law: The :class:`~mitsuba_ext.transport.rejection_law.RejectionLaw` of the test.
+        """
+        raise NotImplementedError
+
+    # ---- Where light paths are tried beside it ----
+
+    @property
+    def efficiency(self) -> float:
+        """The efficiency that its decision has in the pilots, relative to that of ``path``."""
+        return 1.0
+
+    @property
+    def growth(self) -> float:
+        """By what factor more samples are expected to raise :attr:`efficiency`."""
+        return 1.0
+
+    @property
+    def learns_beside_light_paths(self) -> bool:
+        """Whether :meth:`beside_light_paths` makes a learner."""
+        return False
+
+    def beside_light_paths(self, time: float) -> Learner:
+        """A learner that begins with this one's decision, and learns from camera paths that bring
+        less light from now on, because light paths bring the rest. ``time`` is the time of a
+        sample, in units of that of ``path``."""
+        raise NotImplementedError
+
+    def start_again(self) -> Any | None:
+        """The first decision of a learner that :meth:`beside_light_paths` has made."""
+        raise NotImplementedError
+
+    def set_variance(self, variance: float, trimmed: float) -> None:
+        """Tells the variance of a sample of ``path`` with this decision, relative to the squared
+        radiance of its pixel, as a better estimate has found it; and the same without the brightest
+        contributions."""
 
     def __str__(self) -> str:
         """A summary of what was learned; empty if the summary of another learner covers it."""

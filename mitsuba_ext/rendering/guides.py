@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.bsdfs import sample_bsdf
+from ..transport.decisions import CameraSamples
 from ..transport.estimator import Sample
 from ..transport.path_decisions import SceneQuery
 from ..util.arrays import channel_mean
 from . import camera
-from .camera_samples import CameraSamples
 from .plan import check_extent
 
 #: The names of the channels in an OpenEXR file.

@@ -63,9 +63,10 @@ def plan_for_timeout(job: PacedJob) -> RenderPlan:
     fits = taken + int(left * budget.short / max(seconds, 1e-6))
     fits = min(plan.spp, max(taken + 1, fits))
     kernels = (LEARNING_SHARE * left - _FIXED) / max(compiling, 1e-6)
-    pilots = integrator.pilots(job.scene, job.sensor, fits - taken, kernels)
+    learning = integrator.plan_learning(job.scene, job.sensor, fits - taken, kernels)
     budget.pilot_factor = 1.0
-    return replace(plan, stages=(*pilots, fits - taken - sum(pilots)))
+    stages = (*learning.pilots, fits - taken - sum(learning.pilots))
+    return replace(plan, stages=stages, learning=learning)
 
 
 def _tracing(job: PacedJob) -> float:

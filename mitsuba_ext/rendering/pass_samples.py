@@ -6,10 +6,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import frozen
 from . import camera
-from .camera_samples import CameraSamples
 
 
 class GradientsError(Exception):

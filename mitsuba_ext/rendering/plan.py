@@ -37,6 +37,17 @@ _MAX_WAVEFRONT = 1 << 32
 _MOST_PASSES = 1 << 20
 
 
+@dataclass(frozen=True)
+class Learning:
+    """What a render learns. Integrators that learn extend it by what their schedules need.
+
+    Attributes:
+        pilots: Samples per pixel of each pilot stage; empty if nothing is learned.
+    """
+
+    pilots: tuple[int, ...] = ()
+
+
 class Planned(Protocol):
     """The attributes and methods of an integrator that the plan of a render uses."""
 
@@ -52,10 +63,10 @@ class Planned(Protocol):
     def most_lanes(self) -> int:
         """Largest number of samples that are taken at a time, limited by memory."""
 
-    def pilots(
+    def plan_learning(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
-    ) -> list[int]:
-        """The samples per pixel of each pilot stage, out of ``spp``.
+    ) -> Learning:
+        """What a render of ``spp`` samples per pixel learns.
 
         Parameters:
             scene, sensor: What is rendered.
@@ -74,6 +85,7 @@ class RenderPlan:
         seed: Seed of the render.
         spp: Samples per pixel.
         stages: Samples per pixel of each stage: pilots, and the last one.
+        learning: What the pilots are for.
         pixel_count: Sampled pixels of the film.
         structured: Are the samples stratified over the whole render? Then all passes have the same
             length.
@@ -85,6 +97,7 @@ class RenderPlan:
     seed: int
     spp: int
     stages: tuple[int, ...]
+    learning: Learning
     pixel_count: int
     structured: bool
     limit: int
@@ -157,7 +170,8 @@ def plan_render(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
             f"are too many: give at most {limit * _MOST_PASSES}"
         )
-    pilots = integrator.pilots(scene, sensor, spp)
+    learning = integrator.plan_learning(scene, sensor, spp)
+    pilots = list(learning.pilots)
     # With a timeout, sets of samples are kept whole
     set_size = integrator.samples_per_set(spp) if is_timed else 1
     if structured:
@@ -171,7 +185,9 @@ def plan_render(
     stages = (*pilots, spp - sum(pilots))
     # More than one part if even one sample of each pixel is too much at a time
     parts = -(-pixel_count // integrator.most_lanes)
-    return RenderPlan(seed, spp, stages, pixel_count, structured, limit, set_size, parts)
+    return RenderPlan(
+        seed, spp, stages, learning, pixel_count, structured, limit, set_size, parts
+    )
 
 
 def _divides(length: int, spp: int, set_size: int) -> bool:

@@ -30,8 +30,8 @@ from .interrupts import deferred_interrupt, interrupted
 from .pace import plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
-from .plan import Planned, plan_render
-from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
+from .plan import Learning, Planned, plan_render
+from .stages import Schedule, Stage
 from .statistics import RenderStatistics
 from .time_budget import TimeBudget
 from .turns import let_others, tell
@@ -45,9 +45,11 @@ class Staged(Planned, Protocol):
     is_cancelled: bool
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Schedule:
-        """The schedule of a render, whose stages take ``samples`` samples per pixel."""
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
+        learning: Learning,
+    ) -> Schedule:  # fmt: skip
+        """The schedule of a render, whose stages take ``samples`` samples per pixel, and which
+        learns as planned."""
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
         """The stage with which a render with a timeout, of at most ``spp`` samples per pixel,
@@ -187,7 +189,9 @@ class Job:
         )
         self.statistics.interrupted = True  # until the last stage has all its samples
         plan = self.plan = plan_for_timeout(self)
-        schedule = self.integrator.schedule(self.scene, self.sensor, plan.stages, plan.seed)
+        schedule = self.integrator.schedule(
+            self.scene, self.sensor, plan.stages, plan.seed, plan.learning
+        )
         parts = self._first_parts(schedule)
         for index, samples in enumerate(plan.stages):
             if index == 0 and parts:
@@ -198,10 +202,9 @@ class Job:
             is_last = index == len(plan.stages) - 1
             # The first two pilots find out what can be learned, and test it
             if index >= 2 and self.budget.ends_learning(0 if is_last else samples):
-                if isinstance(schedule, EndingSchedule):
-                    schedule.end_learning()
-                    if not is_last:
-                        continue
+                schedule.end_learning()
+                if not is_last:
+                    continue
             stage = self._next_stage(schedule)
             self.statistics.learned = stage.learned
             self.statistics.effects = dict(stage.effects)
@@ -218,7 +221,7 @@ class Job:
         """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
         budget = self.budget.stage(samples, before, is_last)
-        forgets = stage.forgets
+        discards = stage.discards_earlier
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         if stage.images is not None and not self.plan.structured:
             length = min(length, -(-samples // FEWEST_PASSES))
@@ -227,9 +230,9 @@ class Job:
                 return
             spp = length if self.plan.structured else min(length, budget.longest, wanted - done)
             begin = time.perf_counter()
-            if forgets:
+            if discards:
                 # Not before there are others
-                forgets, self.forgotten = False, before
+                discards, self.forgotten = False, before
                 self.block.clear()
                 self.splats = None
             if stage.images is not None and done == 0:
@@ -255,9 +258,7 @@ class Job:
     def _first_parts(self, schedule: Schedule) -> list[np.ndarray]:
         """The pixels of each stage into which the schedule divides the first one; an empty list if
         it is not divided."""
-        if not (self.divides_stages and isinstance(schedule, DivisibleSchedule)):
-            return []
-        if self.plan.structured or self.plan.parts > 1:
+        if not self.divides_stages or self.plan.structured or self.plan.parts > 1:
             return []
         count = schedule.divide_first_stage(self.plan.pixel_count)
         return dithered_parts(*camera.film_extent(self.film), count) if count > 1 else []

@@ -30,7 +30,7 @@ class RenderStatistics:
         effects: For each learned decision (``directions``, ``next_event``, ``light_paths``, …):
             ``is_kept``, the ``variance`` and ``time`` that pilots predict in units of those
             without it, and what else was chosen
-            (:class:`~mitsuba_ext.planning.effect.Effect`; of light paths,
+            (:class:`~mitsuba_ext.planning.prediction.Effect`; of light paths,
             :class:`~mitsuba_ext.estimators.light_paths.choice.predicted_errors.PredictedErrors`).
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
         kernels: The kernels that were ``launched``, and of these the ``loaded`` ones, which came

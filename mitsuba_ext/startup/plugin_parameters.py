@@ -67,7 +67,7 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
     if key.startswith("_arg_"):
         raise ValueError(f'"{name}": {_nameless(value)}')
     message = unread(name, key)
-    if hasattr(plugin, "decision_parameters") and "did you mean" not in message:
+    if hasattr(plugin, "technique") and "did you mean" not in message:
         message += f"; it is for nesting in an integrator, with {_names(plugin)}"
     raise ValueError(message)
 
@@ -75,11 +75,11 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
 def _nameless(value: Any) -> str:
     """Says of a nested plugin without a name that it cannot be used."""
     what = getattr(value, "name", None) or value.class_name()
-    if not hasattr(value, "decision_parameters"):
+    if not hasattr(value, "technique"):
         return f'nothing here uses the nested "{what}": leave it out'
     return f'the nested "{what}" needs the name of what it decides: {_names(value)}'
 
 
 def _names(decision: Any) -> str:
     """The names with which a decision can be nested."""
-    return " or ".join(f'name="{slot}"' for slot in decision.decision_parameters.slots)
+    return " or ".join(f'name="{slot}"' for slot in decision.technique.slots)

@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...rendering import camera
-from ...rendering.camera_samples import CameraSamples
 from ...rendering.pass_samples import look
+from ...transport.decisions import CameraSamples
 from ...transport.path_decisions import NoConnections
 from ...transport.walk import Walk
 from ...util.arrays import from_numpy

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ...planning.learner import Learner
+from ...planning.learner import Learner, Pilot
 from ...transport.path_decisions import Roulette
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
@@ -29,7 +29,7 @@ class RouletteLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Roulette:
         return self._guide.roulette
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> Roulette:
+    def learn(self, pilot: Pilot) -> Roulette:
         return self._guide.roulette
 
     def state(self) -> dict[str, np.ndarray]:

@@ -9,12 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
-from ...planning.effect import Effect
-from ...planning.learner import Learner
+from ...planning.costs import FIRST_GUIDED, GUIDED, RAYS_PER_SEGMENT
+from ...planning.evidence import BATCHES, gain_of
+from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
+from ...planning.prediction import Effect, Prediction
+from ...planning.verdicts import GUIDES_GROW, is_trial, least
 from ...transport.observer import Observer
-from ...transport.path_decisions import DirectionSamples, Roulette
+from ...transport.path_decisions import Roulette
 from ...util.stored_arrays import StoredArrays
 from .adjoint_roulette import AdjointRoulette
 from .decision import GuidedDirections, Regions
@@ -26,20 +28,6 @@ from .surface_regions import SurfaceRegions
 #: The share of the samples that trees decide in the second pilot, and the shares from which one is
 #: chosen once their effects have been measured.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
-
-#: The number of bounces is chosen from at least this share of all pilots' paths.
-_LEAST_SHARE = 0.2
-
-#: The efficiency that guiding must reach. Trees built from all pilots are better than those tested,
-#: but only the last stage uses them.
-_LEAST_EFFICIENCY = 1.03
-
-#: About the number of rays per segment of a path, shadow rays included.
-_RAYS = 1.5
-
-#: The efficiency that trees of few samples must reach for learning to continue: trees of more
-#: samples are better.
-_TRIAL_EFFICIENCY = 0.95
 
 
 class Guidance(NamedTuple):
@@ -139,10 +127,20 @@ class GuideLearner(Learner):
         """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
         self._rr_depth = rr_depth
 
+    @property
+    def learns_beside_light_paths(self) -> bool:
+        return self.guide is not None and self.guidance is not None
+
+    @property
+    def efficiency(self) -> float:
+        return self.guidance.efficiency if self.learns_beside_light_paths else 1.0
+
+    @property
+    def growth(self) -> float:
+        return GUIDES_GROW if self.learns_beside_light_paths else 1.0
+
     def beside_light_paths(self, time: float) -> GuideLearner:
-        """A learner of the same regions for camera paths that bring less light from now on, as
-        light paths bring the rest. Its first guide is that of this learner, but it learns from new
-        samples only. ``time`` is that of a sample, in units of that of ``path``."""
+        # MIS weights are those of unguided paths, which light paths may have as well
         other = GuideLearner(
             self.make_regions, self.wants_scout, self.bounces, self.max_memory,
             self.pilot_samples, self._film_size, self.always,
@@ -151,6 +149,9 @@ class GuideLearner(Learner):
         other._summary, other._time = self._summary, time
         other._begin_records()
         return other
+
+    def start_again(self) -> GuidedDirections | None:
+        return self.guide
 
     # ---- Observer ----
 
@@ -181,37 +182,40 @@ class GuideLearner(Learner):
 
     # ---- Between the stages ----
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> DirectionSamples | None:
+    def learn(self, pilot: Pilot) -> GuidedDirections | None:
         records = self._records
         if records is None:
-            return None
+            return self.guide
         records.finish()
         if self.trial is not None:
             self.trial.finish()
         if records.count == 0:
             self._records, self._summary = None, "no guide: no path scatters"
-            self.roulette = Roulette()
-            return DirectionSamples()
+            self.guide, self.roulette = None, Roulette()
+            return None
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
             # A short trial shows whether guiding is hopeless, but not how many bounces to guide
-            is_trial = records.paths < _LEAST_SHARE * self.pilot_samples / records.stride
-            least = _TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY
+            known = records.paths * records.stride / self.pilot_samples
             gains = self.gains(records)
-            against_path = self._against_path(gains, least)
-            rays = _RAYS * (1 + (records.count - records.first_new) / max(records.paths, 1))
+            bar = least(Prediction(1.0, 1.0, share=known, grows=True), pilot.is_last)
+            against_path = self._against_path(gains, bar)
+            rays = RAYS_PER_SEGMENT
+            rays *= 1 + (records.count - records.first_new) / max(records.paths, 1)
             rays *= self._time
             self.guidance = most_efficient(gains, self.always, *against_path, rays)
-            error = 0.0 if is_trial else self._error(records)
             share, bounces, gain, efficiency = self.guidance
-            if is_trial:
+            prediction = Prediction(
+                1 - gain, 1 / (max(1 - gain, 1e-3) * efficiency), self._error(records), known, True
+            )
+            if is_trial(known, pilot.is_last):
                 bounces = self.bounces
             effect = f"about {max(gain, 0):.0%} less variance"
-            if not (self.always or is_worth(efficiency, error, least)):
+            if not (self.always or pilot.pays(prediction)):
                 self.guide, self._records, self.roulette = None, None, Roulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"
-                return DirectionSamples()
+                return None
         builder, roots, below = self._regions.build(records)
         trees = SampleTrees(
             builder.probability,
@@ -258,17 +262,17 @@ class GuideLearner(Learner):
         self._records = None
 
     def _against_path(
-        self, gains: Mapping[float, np.ndarray], least: float
+        self, gains: Mapping[float, np.ndarray], bar: float
     ) -> tuple[float, float]:
         """Variance and path length of uniform samples with the roulette of the next stage, relative
         to those of ``path``. Returns to the roulette of ``path`` where the last pilot shows that
-        the learned one does not reach ``least`` times its efficiency."""
+        the learned one does not reach ``bar`` times its efficiency."""
         if self.trial is None:
             return 1.0, 1.0
         chosen, path = self.trial.drawn, self.trial.unguided
         by_throughput = self.trial.by_throughput
         if self._rr_depth is not None and not self.always:
-            if chosen.efficiency(by_throughput) < least:
+            if chosen.efficiency(by_throughput) < bar:
                 self._rr_depth, self.roulette, chosen = None, Roulette(), by_throughput
         if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
             return 1.0, 1.0

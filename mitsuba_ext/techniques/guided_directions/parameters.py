@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
 from ...planning.learner import Learner
+from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
 from .learner import GuideLearner
 from .surface_regions import SurfaceRegions
@@ -17,7 +17,7 @@ from .tile_regions import MOST_BOUNCES, TileRegions
 _REGION_SAMPLES = 64
 
 
-class Guided(DecisionParameters):
+class Guided(Technique):
     """Guides directions in primary sample space. The attributes are the parameters of the plugin
     ``guided_directions``; see there.
 
@@ -27,7 +27,7 @@ class Guided(DecisionParameters):
 
     name = "guided_directions"
     slots = ("directions",)
-    pilot_spp, tries = 32, True
+    pilot_spp, tries, finds_all_light = 32, True, True
 
     def __init__(self, read: ParameterReader) -> None:
         self.regions = read("regions", "surfaces", choices=("surfaces", "tiles"))

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.benefit import BATCHES
+from ...planning.evidence import BATCHES
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...util.arrays import joined
@@ -38,7 +38,7 @@ class PathRecords(Observer):
             its samples.
         weight (mi.Float): 1 / density of the sample.
         importance (mi.Float): The weight of a squared error in the pixel of the path.
-        batch (mi.UInt32): The batch of paths (``benefit.py``).
+        batch (mi.UInt32): The batch of paths (``evidence.py``).
         variances (numpy.ndarray): Sums over the paths of their squared errors, with this weight;
             shape [batches].
     """

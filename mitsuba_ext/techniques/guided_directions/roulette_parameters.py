@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...planning.decision_parameters import DecisionParameters, Setting
 from ...planning.learner import Learner
+from ...planning.technique import Setting, Technique
 from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
 
 
-class GuidedRoulette(DecisionParameters):
+class GuidedRoulette(Technique):
     """Russian roulette by the radiance that a path is expected to add to its pixel, where
     directions are guided by regions of surfaces; elsewhere the roulette of Mitsuba's ``path``."""
 
     name = "automatic"
-    slots = ("roulette",)
+    slots, finds_all_light = ("roulette",), True
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         guide = others.get("directions")

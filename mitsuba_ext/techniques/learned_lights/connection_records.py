@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.benefit import BATCHES, SEGMENT, SHADOW, TABLE, gain_of, trimmed_batches
+from ...planning.costs import SEGMENT, SHADOW, TABLE
+from ...planning.evidence import BATCHES, gain_of, trimmed_batches
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...scene.lights.choice import Choice
 from ...transport.mis import power_heuristic
@@ -147,7 +148,7 @@ class ConnectionRecords(Observer):
     @property
     def measured(self) -> tuple[float, float]:
         """The relative reduction of variance by the choice of the last pilot, and its error
-        (``benefit.py``)."""
+        (``evidence.py``)."""
         return gain_of(self._batches)
 
     @property

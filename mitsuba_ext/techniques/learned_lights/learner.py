@@ -10,10 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.benefit import is_worth
-from ...planning.effect import Effect
-from ...planning.learner import Learner
+from ...planning.costs import MAP_ENTRY
+from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
+from ...planning.prediction import Effect, Prediction
+from ...planning.verdicts import FINER_MAP_SHARE, FIRST_MAP_SHARE, REFINING, is_trial
 from ...scene.lights.environment_bins import EnvironmentBins
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.weights import uniform_weights
@@ -21,11 +22,12 @@ from ...scene.regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRow
 from ...scene.regions.surface_sides import region
 from ...transport.light_table import LightTable
 from ...transport.observer import Observer
-from ...transport.path_decisions import EmitterSampling
+from ...transport.rejection_law import RejectionLaw
 from ...util.stored_arrays import StoredArrays
 from . import light_map_file
 from .connection_records import ConnectionRecords
 from .light_map import BYTES_PER_ENTRY, LightMap
+from .shadow_roulette_learner import LightMapRouletteLearner
 
 #: Share of the choices that do not follow the learned map: half of them use the unoccluded
 #: contributions, half the probabilities of ``path``, so that no probability is below 1/20 of that
@@ -36,20 +38,11 @@ _DEFENSIVE = 0.1
 #: the pilots (with about three connections each).
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: The most entries of the first pilot's map, and of a finer one, per sample of the render: an entry
-#: takes a third of the time of a sample, all stages together. And the efficiency that the first
-#: pilot must predict for a finer map to follow.
-_TRIAL_ENTRIES, _MOST_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.0, 1.2
+#: The most entries of the first pilot's map, and of a finer one, per sample of the render.
+_FIRST_ENTRIES, _FINER_ENTRIES = FIRST_MAP_SHARE / MAP_ENTRY, FINER_MAP_SHARE / MAP_ENTRY
 
-#: So many entries may the first pilot's map have in any render: they take about 20 ms.
+#: The entries that the first pilot's map may have in any render: they take about 20 ms.
 _FEW_ENTRIES = 1 << 17
-
-#: The efficiency that a light table must reach; and that which it must reach with few samples for
-#: learning to continue: tables of more samples are little better.
-_LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
-
-#: The final decision is based on at least this share of all pilots' samples.
-_LEAST_SHARE = 0.2
 
 
 class LightMapLearner(Learner):
@@ -107,11 +100,16 @@ class LightMapLearner(Learner):
         self._finer_map: Callable[[], LightMap] | None = None
         self._bins: EnvironmentBins | None = None
 
+    tells_visibility = True
+
+    def shadow_test(self, law: RejectionLaw) -> LightMapRouletteLearner:
+        return LightMapRouletteLearner(self, law)
+
     def keep_map(self) -> None:
         """Keeps the map even where it does not pay for the choice of lights."""
         self._is_needed, self._records = True, None
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightTable | None:
         self.map, self._records, self._bins = None, None, None
         self._summary = "lights: no path scatters"
         if self.load is not None:
@@ -143,10 +141,10 @@ class LightMapLearner(Learner):
     def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
         """The map of the first pilot."""
         limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
-        trial = max(_FEW_ENTRIES, self.render_samples * _TRIAL_ENTRIES)
+        trial = max(_FEW_ENTRIES, self.render_samples * _FIRST_ENTRIES)
         trial = math.inf if self._is_needed else trial
         light_map = self._new_map(scene, p, n, min(limit, trial))
-        limit = min(limit, max(_FEW_ENTRIES, self.render_samples * _MOST_ENTRIES))
+        limit = min(limit, max(_FEW_ENTRIES, self.render_samples * _FINER_ENTRIES))
         if trial < limit and light_map.rows.resolution < _GRID:
             self._finer_map = lambda: self._new_map(scene, p, n, limit)
         return light_map
@@ -209,24 +207,24 @@ class LightMapLearner(Learner):
 
     # ---- Between the stages ----
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> EmitterSampling | None:
+    def learn(self, pilot: Pilot) -> LightTable | None:
         if self.map is None:
             return None
         self.map.evaluate()
         probabilities = self._probabilities(self.map.weights(self.target))
-        if self._records is not None and not self._pays(probabilities, is_last):
+        if self._records is not None and not self._pays(probabilities, pilot):
             self.map = self._records = self._finer_map = None
             self._is_kept = False
-            return EmitterSampling()
+            return None
         # The records are kept in trials: most pilot samples come later
-        if self._finer_map is not None and self._records is not None and not is_last:
-            if self._efficiency >= _FINER_EFFICIENCY:
+        if self._finer_map is not None and self._records is not None and not pilot.is_last:
+            if self._efficiency >= REFINING:
                 self.map, self._finer_map = self._finer_map(), None
                 return self._begin_map()
-        if is_last:
+        if pilot.is_last:
             self._is_kept, self._summary = True, f"{self.map}, {self._effect}"
             if self.save is not None:
-                light_map_file.save(self.save, scene, self.map)
+                light_map_file.save(self.save, pilot.scene, self.map)
         return self._selection(probabilities)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -246,15 +244,14 @@ class LightMapLearner(Learner):
         cells = self.map.cells
         self._as_path = _normalized(uniform_weights(scene, cells), cells.count)
 
-    def _pays(self, probabilities: mi.Float, is_last: bool) -> bool:
-        """Does the map pay by the samples of the last pilot, or may it pay with more samples?"""
+    def _pays(self, probabilities: mi.Float, pilot: Pilot) -> bool:
+        """Whether the map pays by the samples of the last pilot, or may pay with more samples."""
         records = self._records
         records.finish()
-        error = 0.0
-        is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
         if self._is_tested:
             # The samples were drawn from the table, and it was not learned from them
-            (gain, error), cost = records.measured, records.cost
+            (gain, error), time = records.measured, records.cost
+            share = records.samples / self.pilot_samples
             self.removed = records.removed
         else:
             # The prediction is too optimistic, as the table was learned from the same samples, but
@@ -262,23 +259,22 @@ class LightMapLearner(Learner):
             # contributions, and a learned table is rarely worse than that
             as_path = dr.tile(self._as_path, self.map.rows.count)
             predicted = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
-            gain = max(predicted, records.measured[0])
-            is_trial, cost = not is_last, records.least_cost
-        efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+            gain, error = max(predicted, records.measured[0]), 0.0
+            share, time = 0.0, records.least_cost
+        prediction = Prediction(1 - gain, time, error, share)
+        self._efficiency = prediction.efficiency
         if not self._about:
-            self._measured = 1 - gain, cost
+            self._measured = prediction.variance, time
         left, time = self._measured
         self._effect = f"about {max(0.0, 1 - left):.0%} less variance in {time:.2f} x the time"
-        # A trial need not be certain
-        least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
-        if not is_worth(efficiency, error, least):
+        if not pilot.pays(prediction):
             would = f"a map would give {self._effect}"
             self._summary = f"lights as path chooses them: {would} ({self.map})"
             return False
         self._is_tested = True
         # Later pilots go on recording: without that, they would have other kernels
         records.restart()
-        if not is_trial:
+        if not is_trial(share, pilot.is_last):
             self._finer_map = None
         return True
 
@@ -295,9 +291,9 @@ class LightMapLearner(Learner):
         return LightTable(self.map.rows, self.map.cells, probabilities)
 
     def set_variance(self, variance: float, trimmed: float) -> None:
-        """Sets the variance of a sample of ``path`` with the map, in the units of :attr:`removed`,
-        for :attr:`effect`: pilots of ``path`` hold few of the rare paths that make most of it.
-        ``trimmed`` is that without the brightest contributions."""
+        # Pilots of ``path`` hold few of the rare paths that make most of its variance
+        if self.removed is None:
+            return
         left, trimmed = (x / max(x + self.removed, 1e-30) for x in (variance, trimmed))
         self._measured, self._about = (left, self._measured[1]), {"trimmed_variance": trimmed}
 

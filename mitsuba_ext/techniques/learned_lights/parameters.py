@@ -8,8 +8,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 from ...planning.learner import Learner
+from ...planning.technique import ParameterReader, Setting, Slots, Technique
 from ...rendering.camera import film_extent
 from ...util import archives
 from ...util.errors import InputError
@@ -20,7 +20,7 @@ from .learner import LightMapLearner
 TARGETS = ("contribution", "visibility")
 
 
-class LearnedLights(DecisionParameters):
+class LearnedLights(Technique):
     """Chooses lights by what the pilots' samples found. The attributes are the parameters of the
     plugin ``learned_lights``; see there.
 
@@ -30,7 +30,7 @@ class LearnedLights(DecisionParameters):
 
     name = "learned_lights"
     slots = ("next_event",)
-    pilot_spp, tries = 16, True
+    pilot_spp, tries, tells_visibility = 16, True, True
 
     def __init__(self, read: ParameterReader, target: str = "") -> None:
         self.target = target or read("target", TARGETS[0], choices=TARGETS)

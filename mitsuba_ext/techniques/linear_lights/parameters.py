@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...planning.decision_parameters import DecisionParameters, Setting
+from ...planning.technique import Setting, Technique
 from .linear_lights import LinearChoice
 
 
-class LinearLights(DecisionParameters):
+class LinearLights(Technique):
     """Chooses lights by an estimate of what each contributes to the vertex."""
 
     name = "linear"

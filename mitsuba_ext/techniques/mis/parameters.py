@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
+from ...planning.technique import ParameterReader, Setting, Slots, Technique
 from ...transport.mis import cutoff_heuristic_of, maximum_heuristic, power_heuristic_of
 from ...transport.path_decisions import ConnectionsAlone, ScatteringAlone, Weights
 
@@ -27,7 +27,7 @@ _MAKERS: Mapping[str, Callable[[Any], Weights]] = MappingProxyType(
 HEURISTICS = tuple(_MAKERS)
 
 
-class MisHeuristic(DecisionParameters):
+class MisHeuristic(Technique):
     """The MIS weights of connections and of BSDF samples. The attributes are the parameters of the
     plugin ``mis_heuristic``; see there.
 

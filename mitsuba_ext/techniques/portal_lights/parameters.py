@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...planning.technique import ParameterReader, Setting, Technique
 from ...scene.portals import portals
 from .portal_sampling import PortalSampling
 
 
-class PortalLights(DecisionParameters):
+class PortalLights(Technique):
     """Samples directions of the environment through portals. The attributes are the parameters of
     the plugin ``portal_lights``; see there."""
 

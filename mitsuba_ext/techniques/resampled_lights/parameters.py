@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...planning.technique import ParameterReader, Setting, Technique
 from .resampled_lights import ResampledLights
 
 #: Number of candidates that take about as long as a path.
 _CANDIDATES_PER_PATH = 32
 
 
-class ResampledLightsChoice(DecisionParameters):
+class ResampledLightsChoice(Technique):
     """Chooses one of several candidate lights by what each would contribute. The attributes are the
     parameters of the plugin ``resampled_lights``; see there."""
 

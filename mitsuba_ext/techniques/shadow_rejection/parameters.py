@@ -8,11 +8,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 from ...planning.learner import Learner
-from ..learned_lights.learner import LightMapLearner
-from ..learned_lights.parameters import LearnedLights
-from .light_map_roulette_learner import LightMapRouletteLearner
+from ...planning.technique import ParameterReader, Setting, Slots, Technique
+from ...transport.rejection_law import RejectionLaw
 from .visibility_roulette import has_lights_at_points
 from .visibility_roulette_learner import VisibilityRouletteLearner
 
@@ -23,7 +21,7 @@ _GRID = 16
 _OF_OWN_MAP = ("grid", "max_memory", "refine")
 
 
-class RejectedShadowRays(DecisionParameters):
+class RejectedShadowRays(Technique):
     """Russian roulette of shadow rays by learned visibility. The attributes are the parameters of
     the plugin ``visibility_roulette``; see there.
 
@@ -71,17 +69,12 @@ class RejectedShadowRays(DecisionParameters):
         return spp > 0 and (not self._has_own_map or has_lights_at_points(scene))
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
-        law = {
-            "law": self.law,
-            "slope": getattr(self, "slope", 0.0),
-            "floor": getattr(self, "floor", 1.0),
-        }
-        lights = others.get("next_event")
-        if isinstance(lights, LightMapLearner):
-            return LightMapRouletteLearner(lights, **law)
+        law = RejectionLaw(self.law, getattr(self, "slope", 0.0), getattr(self, "floor", 1.0))
+        if "next_event" in others and others["next_event"].tells_visibility:
+            return others["next_event"].shadow_test(law)
         if not self._has_own_map or not self.can_learn(setting.scene, setting.pilot_spp):
             return None
-        return VisibilityRouletteLearner(self.grid, self.max_memory, self.refine, **law)
+        return VisibilityRouletteLearner(self.grid, self.max_memory, self.refine, law)
 
     def _uses_own_map(self, slots: Slots) -> bool:
-        return not isinstance(slots.get("next_event"), LearnedLights)
+        return not getattr(slots.get("next_event"), "tells_visibility", False)

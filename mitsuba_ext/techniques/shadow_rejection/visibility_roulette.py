@@ -12,7 +12,7 @@ import mitsuba as mi
 from ...scene.bounds import scene_bounds
 from ...scene.regions.voxel_grid import EMPTY
 from ...transport.path_decisions import ShadowTest
-from .rejection_law import RejectionLaw, rejected_share
+from ...transport.rejection_law import RejectionLaw, rejected_share
 from .visibility_map import VisibilityMap
 
 
@@ -24,14 +24,14 @@ class VisibilityRoulette(ShadowTest):
 
     Parameters:
         visibility: The learned map, which must have seen a light.
-        slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
+        law: The probability of a test.
 
     Attributes:
         rejected_share (float): Of the recorded segments that end on a light, the share that the
             roulette would not test.
     """
 
-    def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
+    def __init__(self, visibility: VisibilityMap, law: RejectionLaw) -> None:
         self.voxels = visibility.voxels
         # Connections end on lights: of the whole map, only the columns of the lights' voxels are
         # kept, which fit into the cache
@@ -46,7 +46,7 @@ class VisibilityRoulette(ShadowTest):
         light = dr.gather(mi.UInt32, lights, index - voxel * self._light_count)
         entry = visibility.entry_of(voxel, light)
         # The paper's law: plain ratios, and ε where no success was seen (section 3.2)
-        self._p = RejectionLaw(law, slope, floor).probability(
+        self._p = law.probability(
             lambda: visibility.ratio(entry), lambda: visibility.posterior_mean(entry)
         )
         dr.eval(self._column, self._p)

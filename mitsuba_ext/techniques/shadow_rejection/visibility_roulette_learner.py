@@ -9,10 +9,11 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ...planning.learner import Learner
+from ...planning.costs import REJECTION
+from ...planning.learner import Learner, Pilot
 from ...transport.path_decisions import ShadowTest
+from ...transport.rejection_law import RejectionLaw
 from ...util.stored_arrays import StoredArrays
-from .rejection_law import WORTHWHILE
 from .visibility_map import VisibilityMap
 from .visibility_roulette import VisibilityRoulette
 
@@ -21,14 +22,15 @@ class VisibilityRouletteLearner(Learner):
     """Learns a visibility map in the pilots, and rejects shadow rays with it in the last stage.
 
     Parameters:
-        grid, max_memory, refine, law, slope, floor: See the integrator ``neepp``.
+        grid, max_memory, refine: See the integrator ``neepp``.
+        law: The probability of a test.
     """
 
     def __init__(
-        self, grid: int, max_memory: float, refine: int, law: str, slope: float, floor: float
+        self, grid: int, max_memory: float, refine: int, law: RejectionLaw
     ) -> None:
         self._grid, self._max_memory, self._refine = grid, int(max_memory * 2**20), refine
-        self._law = {"law": law, "slope": slope, "floor": floor}
+        self._law = law
         self._summary = ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
@@ -40,10 +42,10 @@ class VisibilityRouletteLearner(Learner):
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         self._map.segment(p, q, active)
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> ShadowTest | None:
-        if not is_last:
+    def learn(self, pilot: Pilot) -> ShadowTest | None:
+        if not pilot.is_last:
             return None
-        self._map.refine(scene, self._refine)
+        self._map.refine(pilot.scene, self._refine)
         return self._make_roulette()
 
     def _make_roulette(self) -> ShadowTest | None:
@@ -51,8 +53,8 @@ class VisibilityRouletteLearner(Learner):
         self._summary = str(self._map)
         roulette = None
         if len(self._map.light_voxels()) > 0:
-            roulette = VisibilityRoulette(self._map, **self._law)
-            if roulette.rejected_share < WORTHWHILE:
+            roulette = VisibilityRoulette(self._map, self._law)
+            if roulette.rejected_share < REJECTION:
                 self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
                 roulette = None
         return roulette

@@ -6,7 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
+from ...planning.technique import ParameterReader, Setting, Slots, Technique
 from ...scene.bounds import scene_bounds
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.shutter_times import ShutterTimes
@@ -18,7 +18,7 @@ from ...transport.light_table import TABLE_BYTES, LightTable, OneRow
 _SPATIAL_GRID = 32
 
 
-class PowerLights(DecisionParameters):
+class PowerLights(Technique):
     """Chooses lights by their power."""
 
     name = "power"
@@ -31,7 +31,7 @@ class PowerLights(DecisionParameters):
         return LightTable(OneRow(), cells, power_weights(setting.scene, cells))
 
 
-class SpatialLights(DecisionParameters):
+class SpatialLights(Technique):
     """Chooses lights by their unoccluded contribution to a voxel. The attributes are the parameters
     of the plugin ``spatial_lights``; see there."""
 

@@ -8,9 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.effect import Effect
-from ...planning.learner import Learner
+from ...planning.costs import SWARMING
+from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import brightness
+from ...planning.prediction import Effect, Prediction
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ...util.arrays import from_numpy
@@ -23,10 +24,6 @@ from .tile_counts import Candidate, Choices, TileCounts
 #: The forms of densities from which one is chosen; and the form before their gains are measured.
 _FORMS = (Form(True, 0.2), Form(False, 0.05))
 _FIRST_FORM = Form(False, 0.2)
-
-#: The relative reduction of the image's variance that a map must reach to be used: samples that are
-#: drawn from maps take about 5 % longer, and learning takes time.
-_LEAST_GAIN = 0.1
 
 #: Maps are given up if they do not pay after this number of samples per pixel, in this number of
 #: stages.
@@ -158,18 +155,17 @@ class MapLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any:
         return self.decision
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> Any | None:
+    def learn(self, pilot: Pilot) -> Any:
         self._collect()
         counts = self._counts
         if counts is None:
-            return None
+            return self.decision
         gains, form = counts.gains(), _FIRST_FORM
         if len(gains) > 0:
             best = int(np.argmax(gains))
             self.gain, form = float(gains[best]), _FORMS[best]
-            if self.gain < _LEAST_GAIN and self.decision.maps is not None and not self._always:
-                self._give_up()
-                return None
+            if self.decision.maps is not None and not self._pays(pilot, self.gain):
+                return self._given_up()
         samples = counts.samples / np.prod(self._extent)
         grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
         shares = Shares(estimate(*counts.sums(), grid, self._widths), self._widths)
@@ -180,29 +176,34 @@ class MapLearner(Learner):
         if len(gains) == 0:
             self.gain = expected
         self.decision.maps = None
-        if self._always or min(self.gain, expected) >= _LEAST_GAIN:
+        if self._pays(pilot, min(self.gain, expected)):
             self.decision.maps = CellDensities(self.cells, shares.mass(form))
             self.decision.tiles = self.tiles
         elif samples >= _ENOUGH_SAMPLES:
             self._vain_stages += 1
             if self._vain_stages >= _VAIN_STAGES:
-                self._give_up()
-                return None
+                return self._given_up()
         self._memory = counts.bytes + shares.bytes
         if self.decision.maps is not None:
             self._memory += self.decision.maps.bytes
-        if not is_last:
+        if not pilot.is_last:
             # The next stage has as many samples as all stages so far
             tiles = self._tiles(2 * samples)
             counts.begin_stage([self._candidate(shares, form, tiles) for form in _FORMS])
             if tiles.edge < self.tiles.edge:
                 counts.divide(tiles)
                 self.tiles = tiles
-        return None
+        return self.decision
 
-    def _give_up(self) -> None:
+    def _pays(self, pilot: Pilot, gain: float) -> bool:
+        """Whether maps pay that reduce the variance by ``gain``."""
+        return self._always or pilot.pays(Prediction(1 - gain, 1.0, overhead=SWARMING))
+
+    def _given_up(self) -> Any:
+        """The decision without maps, once there is no hope for them."""
         self.decision.maps = None
         self.stop()
+        return self.decision
 
     def _tiles(self, samples: float) -> FilmTiles:
         """The tiles that have maps once each pixel has this number of samples."""
@@ -255,6 +256,10 @@ class MapLearner(Learner):
         if self._counts is not None and self._radiance is not None:
             self._counts.add(self._pixel, self._radiance, self.choices(self._radiance))
         self._radiance = None
+
+    @property
+    def efficiency(self) -> float:
+        return 1 / max(1 - self.gain, 1e-3) if self.decision.maps is not None else 1.0
 
     @property
     def effect(self) -> Effect:

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ...planning.learner import Learner
+from ...planning.learner import Learner, Pilot
 from ...scene.lights.environment_texels import EnvironmentTexels
 from ...scene.lights.texel_sums import TexelSums
 from ...util.stored_arrays import StoredArrays
@@ -46,10 +46,10 @@ class VisibilityLearner(Learner):
     def connection(self, *arguments: Any) -> None:
         self._counts.connection(*arguments)
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> TwoStage:
+    def learn(self, pilot: Pilot) -> TwoStage:
         self._state = {"counts": self._counts.counts}
         self._summary = str(self._counts)
-        return self._learned(scene)
+        return self._learned(pilot.scene)
 
     def state(self) -> dict[str, np.ndarray]:
         return self._state

@@ -7,8 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
 from ...planning.learner import Learner
+from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
 from .environment_partition import MOST_SPLITS
 from .learner import VisibilityLearner
@@ -20,7 +20,7 @@ VISIBILITIES = ("unknown", "primary", "world")
 _PILOT_SPP = 4
 
 
-class TwoStageLights(DecisionParameters):
+class TwoStageLights(Technique):
     """Samples directions of the environment by the product of BSDF and light. The attributes are
     the parameters of the plugin ``two_stage_lights``; see there."""
 

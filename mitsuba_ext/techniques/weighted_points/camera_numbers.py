@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...planning.technique import ParameterReader, Setting, Technique, check_has_wavelengths
 from ...util.pointsets import PATTERNS
-from ..swarming.parameters import check_has_wavelengths
 from .pixel_sets import PixelSets
 from .weighted_sets import WEIGHTS, WeightedSets
 
@@ -41,7 +40,7 @@ PURPOSES = {
 }
 
 
-class WeightedNumbers(DecisionParameters):
+class WeightedNumbers(Technique):
     """Numbers from weighted point sets. The attributes are the parameters of the plugin
     ``weighted_numbers``; see there.
 
@@ -67,14 +66,19 @@ class WeightedNumbers(DecisionParameters):
         if slot == "wavelength":
             check_has_wavelengths(plugin)
 
-    def numbers(self, plugin: str, slot: str, setting: Setting) -> PixelSets | None:
+    needs_equal_samples = 'the sets of numbers of "{slot}" belong together: leave the parameter out'
+
+    def samples_per_set(self, spp: int, is_timed: bool) -> int:
+        return samples_per_set(spp, is_timed)
+
+    def decision(self, setting: Setting) -> PixelSets | None:
         """The numbers of a render; ``None``, with a warning, if the image does not depend on them.
         """
-        reason = _reason_to_do_nothing(slot, setting.sensor)
+        reason = _reason_to_do_nothing(setting.slot, setting.sensor)
         if reason is not None:
-            mi.Log(mi.LogLevel.Warn, f'"{plugin}" reweights nothing: {reason}')
+            mi.Log(mi.LogLevel.Warn, f'"{setting.plugin}" reweights nothing: {reason}')
             return None
-        purpose = PURPOSES[slot]
+        purpose = PURPOSES[setting.slot]
         seeds = [setting.seed, purpose.index]
         count = samples_per_set(setting.spp, setting.is_timed)
         sets = WeightedSets(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...planning.decision_parameters import DecisionParameters, ParameterReader, Setting
+from ...planning.technique import ParameterReader, Setting, Technique
 from ...util.pointsets import PATTERNS
 from .weighted_connections import NoFirstConnections, WeightedConnections
 from .weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
@@ -16,7 +16,7 @@ _MOST = 4096
 _PER_PATH = 16
 
 
-class Connections(DecisionParameters):
+class Connections(Technique):
     """The number of connections of a vertex, and the point sets that choose them. The attributes
     are the parameters of the plugin ``weighted_connections``; see there.
 

@@ -11,7 +11,7 @@ import pytest
 from mitsuba_ext.bases import light_path_schedule
 from mitsuba_ext.estimators.light_paths.choice import photon_trial
 from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonTrial
-from mitsuba_ext.planning.promise import Promise
+from mitsuba_ext.planning.prediction_check import PredictionCheck
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES
 from tests.support.fogs import cube, fog, homogeneous
 from tests.support.stage import area, lookat
@@ -57,13 +57,13 @@ def test_photons_render_light_that_camera_paths_miss(tmp_path) -> None:
 
 
 def test_photons_replace_camera_paths_of_more_variance(monkeypatch: pytest.MonkeyPatch) -> None:
-    def is_broken(promise: Promise, time: float, rival: float) -> bool:
+    def failed(promise: PredictionCheck, time: float, rival: float) -> bool:
         assert promise.images.count >= FEWEST_PASSES and time < 1 and rival < 1
         promise.variance = 100.0
         return True
 
     monkeypatch.setattr(photon_trial, "is_worth", lambda *_: False)
-    monkeypatch.setattr(Promise, "is_broken", is_broken)
+    monkeypatch.setattr(PredictionCheck, "failed", failed)
     scene, auto = mi.load_dict(beam_through_glass()), make()
     found = image(auto, scene)
     effect = auto.statistics.effects["light_paths"]

@@ -8,15 +8,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-
 from mitsuba_ext.bases.light_path_schedule import LightPathSchedule
+
 from mitsuba_ext.estimators.light_paths.choice import light_paths
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
 from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathChoice, LightPathTrial
 from mitsuba_ext.estimators.light_paths.choice.predicted_errors import PredictedErrors
 from mitsuba_ext.estimators.light_paths.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.images.coarse_film import CoarseFilm
-from mitsuba_ext.planning.promise import Promise
+from mitsuba_ext.planning.prediction_check import PredictionCheck
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
 from mitsuba_ext.rendering.stages import Stage
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
@@ -73,13 +73,13 @@ def test_a_broken_promise_is_seen(efficiency: float) -> None:
     border = 2 * film.rfilter().border_size()
     coarse = CoarseFilm.of(_SIZE + border, _SIZE + border, 512)
     of_path = np.full(coarse.width * coarse.height, 1 / 12 + 0.5 * 2**2)
-    promise = Promise(film, coarse, of_path)
-    assert not promise.is_broken(time=9.0, rival=9.0)
+    promise = PredictionCheck(film, coarse, of_path)
+    assert not promise.failed(time=9.0, rival=9.0)
     fill(promise.images, film, FEWEST_PASSES)
     # The variance is that of ``path``
-    is_broken = promise.is_broken(time=2 / efficiency, rival=0.5)
+    failed = promise.failed(time=2 / efficiency, rival=0.5)
     assert promise.variance == pytest.approx(1, rel=0.05)
-    assert is_broken == (efficiency < 0.9)
+    assert failed == (efficiency < 0.9)
 
 
 def test_a_given_weight_lets_rare_bright_samples_count() -> None:
@@ -91,14 +91,14 @@ def test_a_given_weight_lets_rare_bright_samples_count() -> None:
     bright[[500, 1500]] = 1000, 2000
     variances = {}
     for weight in (None, np.ones(_SIZE * _SIZE)):
-        promise = Promise(film, coarse, np.ones(_SIZE * _SIZE), weight=weight)
+        promise = PredictionCheck(film, coarse, np.ones(_SIZE * _SIZE), weight=weight)
         block = film.create_block()
         promise.images.begin(block, None, 0)
         for number in range(FEWEST_PASSES):
             value = mi.Float(bright if number == 0 else np.ones(_SIZE * _SIZE))
             block.put(mi.Point2f(x, y), [value, value, value, mi.Float(1)])
             promise.images.add(block, None, number + 1)
-        promise.is_broken(1.0, 1.0)
+        promise.failed(1.0, 1.0)
         variances[weight is None] = promise.variance
     expected = 999**2 / 3 / (_SIZE**2 - 1)
     assert variances[False] == pytest.approx(expected, rel=0.01)
@@ -120,7 +120,7 @@ def test_guides_help_light_paths_too_but_not_merging(merges: bool, expected: flo
     trial.rival, trial.guide_efficiency, trial.costs, trial._best = 8.0, 4.0, [1.0, 2.0], 1
     trial._choice = LightPathChoice(Candidate(0.25, merges=merges))
     seen = []
-    trial.promise = SimpleNamespace(is_broken=lambda *arguments: seen.append(arguments))
+    trial.check = SimpleNamespace(failed=lambda *arguments: seen.append(arguments))
     assert trial.reconsider(time=1.0, margin=1.1) is None
     assert seen == [(2.0, expected)]
 
@@ -171,7 +171,7 @@ def test_going_back_brings_back_the_guide_as_it_is() -> None:
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
 
-    def is_broken(promise: Promise, time: float, rival: float) -> bool:
+    def failed(promise: PredictionCheck, time: float, rival: float) -> bool:
         counts.append(promise.images.count)
         promise.variance = 5.0
         return True
@@ -182,7 +182,7 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
         stages.append(next_stage(schedule))
         return stages[-1]
 
-    monkeypatch.setattr(Promise, "is_broken", is_broken)
+    monkeypatch.setattr(PredictionCheck, "failed", failed)
     monkeypatch.setattr(LightPathSchedule, "next_stage", remembered)
     integrator = mi.load_dict({"type": "auto", "max_depth": 6})
     scene = load("caustic", width=96, height=54)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.transport.queries.scene import scene_query
 from tests.support.motions import Pose, at, camera, keyed, pair, room, sky, uniform
 from tests.support.stage import area, bitmap, diffuse, rectangle, rgb

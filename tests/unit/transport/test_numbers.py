@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.weights import power_weights
 from mitsuba_ext.transport.estimator import CameraRays

@@ -12,11 +12,22 @@ import mitsuba as mi
 import numpy as np
 
 from ....images.coarse_film import CoarseFilm
-from ....planning.benefit import SEGMENT, SHADOW, expected_gain
-from ....planning.decision_parameters import DecisionParameters, Setting, Slots
-from ....planning.effect import Effect
-from ....planning.learner import Learner
-from ....planning.promise import Promise
+from ....planning import verdicts
+from ....planning.costs import (
+    CONNECTED,
+    CONNECTION,
+    GRID,
+    LIGHT_SEGMENT,
+    LOOK,
+    SEGMENT,
+    SHADOW,
+    SUMS,
+)
+from ....planning.learner import Learner, Pilot
+from ....planning.prediction import Effect
+from ....planning.prediction_check import PredictionCheck
+from ....planning.technique import Setting, Slots, Technique
+from ....planning.trial import Rival, Trial
 from ....rendering.camera import film_extent, first_pixel
 from ....scene.movers import movers
 from ....util.stored_arrays import StoredArrays
@@ -24,14 +35,6 @@ from .candidates import MOST_TRIED, Candidate
 from .path_moments import Counts, Estimate, PathMoments
 from .predicted_errors import PredictedErrors
 from .technique_observer import TechniqueObserver
-
-#: The time of what a sample does, in the units of :data:`SEGMENT`: partial sums along a segment of
-#: a camera path; a segment of a light path. A connection of each vertex, and its shadow ray. With
-#: merging: a vertex that is put into the grid; vertices and cells that are looked at. They are
-#: constants, because with measured times two renders of the same seed could choose differently. (A
-#: fit to seven sets of techniques without merging in 14 scenes, and to three, two of them with
-#: merging, in seven: 0.91 of the times within 1.2. spotlights takes 1.1 to 1.6 times as long.)
-_SUMS, _LIGHT_SEGMENT, _CONNECTION, _CONNECTED, _GRID, _LOOK = 0.17, 3.1, 0.3, 1.3, 0.7, 0.1
 
 #: Number of samples from which the choice is made, unless the pilots have fewer.
 _ENOUGH = 1 << 15
@@ -42,16 +45,8 @@ _ENOUGH = 1 << 15
 #: ``path``. (Trials of all sizes kept the same techniques in twelve scenes.)
 _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 
-#: Guided directions are expected to keep this power of their efficiency beside light paths. (The
-#: first pilots with both have guides of few samples, and show less.)
-_KEPT = 0.5
-
-#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
-#: find all light alone. (Guides are learned again.)
-OF_CAMERA_PATHS = ("directions", "roulette", "time", "aperture", "wavelength", "distance")
-
-#: The least share of missing light of which a render tells.
-_WORTH_A_WORD = 1e-3
+#: The least share of missing light that statistics report.
+_MIN_REPORTED_MISSING = 1e-3
 
 #: The most light paths for each camera path.
 MOST_PATHS = 64.0
@@ -72,7 +67,7 @@ class LightPathChoice:
     pixel_width: float = 1.0
 
 
-class LightPathCount(DecisionParameters):
+class LightPathCount(Technique):
     """So many light paths for each camera path. The attribute is the parameter."""
 
     slots = ("light_paths",)
@@ -110,7 +105,7 @@ def check_shared_rays(plugin: str, scene: mi.Scene, count: float) -> None:
         )
 
 
-class LightPathsWhereTheyPay(DecisionParameters):
+class AutoLightPaths(Technique):
     """As many light paths, and those of their techniques, as a pilot finds to be worth the time."""
 
     name = "auto"
@@ -129,7 +124,7 @@ class LightPathsWhereTheyPay(DecisionParameters):
         return LightPathTrial(setting.sensor.film(), setting.spp)
 
 
-class LightPathTrial(Learner):
+class LightPathTrial(Trial):
     """Chooses the candidate with the least squared error of a render of this length
     (:class:`PredictedErrors`), times its time. The time is estimated from the number of rays.
 
@@ -141,16 +136,12 @@ class LightPathTrial(Learner):
 
     Attributes:
         samples: A pixel for each sample, of these only.
-        rival: The efficiency of ``path`` with what else was learned for it, relative to ``path``.
-        guide_efficiency: That of guided directions, of which :attr:`rival` is a multiple.
+        rival: What light paths had to beat.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
         predicted, costs: Errors and time of each candidate, relative to ``path``.
-        leaves_out: If light paths pay, these slots decide as ``path``.
-        promise: Tests what was chosen; ``None`` if that is ``path``.
+        check: Checks what was chosen; ``None`` if that is ``path``.
     """
-
-    leaves_out = OF_CAMERA_PATHS
 
     def __init__(self, film: mi.Film, spp: int, is_sparse: bool = False) -> None:
         extent = film_extent(film)
@@ -165,12 +156,12 @@ class LightPathTrial(Learner):
             observer=self._moments, pixel_width=coarse.pixel_width
         )
         self.samples, self._spp, self._pixel_count = coarse.samples, spp, coarse.pixel_count
-        self.rival = self.guide_efficiency = 1.0
+        self.rival = Rival()
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
         self.predicted: PredictedErrors | None = None
         self.costs = np.zeros(0)
-        self.promise: Promise | None = None
+        self.check: PredictionCheck | None = None
 
     @property
     def chosen_variance(self) -> float:
@@ -179,61 +170,69 @@ class LightPathTrial(Learner):
         return float(self.predicted.long_run[self._best])
 
     @property
-    def chosen_cost(self) -> float:
+    def chosen_time(self) -> float:
         """The time of a sample of what was chosen, relative to ``path``."""
         return float(self.costs[self._best])
 
     @property
+    def path_variance(self) -> tuple[float, float] | None:
+        return None if self.predicted is None else self.predicted.of_image
+
+    @property
     def can_be_guided(self) -> bool:
-        """Are camera paths guided beside what was chosen? (Beside merging, it was not tried.)"""
+        # Beside merging, it was not tried
         return not self._choice.techniques.merges
+
+    @classmethod
+    def in_own_stage(cls, film: mi.Film, spp: int) -> LightPathTrial:
+        """A sparse trial."""
+        return cls(film, spp, is_sparse=True)
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
         """Is a sparse trial worth its time, for a render of so many samples?"""
         return _LEAST_SPARSE <= spp * pixel_count * _MOST
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightPathChoice:
+    def first_choice(self) -> LightPathChoice:
         return self._choice
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> LightPathChoice | None:
+    def learn(self, pilot: Pilot) -> LightPathChoice:
         moments = self._moments
-        if moments is None or (moments.samples < _ENOUGH and not is_last):
-            return None
-        self._moments, self.candidates = None, moments.candidates
-        self.estimate = estimate = moments.estimate()
-        self.predicted = predicted = PredictedErrors.of(
-            estimate, self._width, self._spp, self._pixel_count
-        )
-        costs = np.array([cost(c, moments.counts) for c in moments.candidates])
-        self.costs = costs / costs[0]
-        # Prior: the efficiency is that of all techniques
-        efficiencies = 1 / (predicted.variances * self.costs)
-        efficiencies /= efficiencies[1]
-        efficiencies[0] *= self.rival
-        gains = [expected_gain(*x) for x in zip(efficiencies, predicted.uncertainty)]
-        best = self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
-        gains[best] += math.log(self._of_guide(moments.candidates[best]))
-        self._best = best if gains[best] > gains[0] else 0
-        self._choice = LightPathChoice(moments.candidates[self._best])
-        if self._best > 0:
-            self.promise = Promise(self._film, self._coarse, predicted.of_path)
+        if moments is not None and (moments.samples >= _ENOUGH or pilot.is_last):
+            self.choose(Rival())
         return self._choice
 
-    def reconsider(self, time: float, margin: float) -> LightPathChoice | None:
-        """What is chosen instead of light paths if these have not kept their promise: ``path``, for
-        which :attr:`rival` says what matters, and which needs no margin. See :class:`PhotonTrial`.
-        """
-        rival = self.rival / self._of_guide(self._choice.techniques)
-        if self.promise is None or not self.promise.is_broken(self.chosen_cost, rival):
+    def choose(self, rival: Rival) -> LightPathChoice | None:
+        moments, self._moments, self.rival = self._moments, None, rival
+        self.candidates, self.estimate = moments.candidates, moments.estimate()
+        self.predicted = predicted = PredictedErrors.of(
+            self.estimate, self._width, self._spp, self._pixel_count
+        )
+        times = np.array([cost(c, moments.counts) for c in moments.candidates])
+        self.costs = times / times[0]
+        guided = [self._of_guides(candidate) for candidate in moments.candidates]
+        self._best, self._best_with_light_paths = verdicts.best(
+            1 / (predicted.variances * self.costs), predicted.uncertainty, rival.efficiency, guided
+        )
+        self._choice = LightPathChoice(moments.candidates[self._best])
+        if self._best == 0:
+            return None
+        self.check = PredictionCheck(self._film, self._coarse, predicted.of_path)
+        return self._choice
+
+    def reconsider(self, rival: Rival, time: float, margin: float) -> LightPathChoice | None:
+        """``path``, if light paths have more variance than predicted, and less efficiency."""
+        self.rival = rival
+        least = rival.efficiency / self._of_guides(self._choice.techniques)
+        if self.check is None or not self.check.failed(self.chosen_time, least):
             return None
         self._choice = LightPathChoice(Candidate(0.0))
         return self._choice
 
-    def _of_guide(self, techniques: Candidate) -> float:
+    def _of_guides(self, techniques: Candidate) -> float:
         """The efficiency that guided directions are expected to have beside light paths; 1 with
         merging, where there are none."""
-        return 1.0 if techniques.merges else self.guide_efficiency**_KEPT
+        return 1.0 if techniques.merges else verdicts.beside_light_paths(self.rival.guides)
 
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
@@ -251,21 +250,21 @@ class LightPathTrial(Learner):
         if self.estimate is None:
             return Effect(is_kept, about=asdict(techniques))
         index, predicted = self._shown, self.predicted
-        variance = promised = predicted.variances[index]
+        variance = expected = predicted.variances[index]
         about = {
-            "rival": self.rival, **asdict(self.candidates[index]),
+            "rival": self.rival.efficiency, **asdict(self.candidates[index]),
             "missed": predicted.missed[index], "missed_by_path": predicted.missed[0],
-            "predicted_variance": promised,
+            "predicted_variance": expected,
         }  # fmt: skip
         if self._measured is not None:
             about["measured_variance"] = variance = self._measured
         figures = {"trimmed_variance": predicted.trimmed, "long_run_variance": predicted.long_run}
-        about |= {name: x[index] * variance / promised for name, x in figures.items()}
+        about |= {name: x[index] * variance / expected for name, x in figures.items()}
         return Effect(is_kept, float(variance), float(self.costs[index]), about)
 
     @property
     def _measured(self) -> float | None:
-        return self.promise.variance if self.promise else None
+        return self.check.variance if self.check else None
 
     @property
     def _shown(self) -> int:
@@ -287,7 +286,8 @@ class LightPathTrial(Learner):
         )
         # After going back, that of ``path``
         missed = predicted.missed[self._best if pays else 0]
-        return text if missed < _WORTH_A_WORD else f"{text}; {missed:.1%} of the light is missing"
+        is_told = missed >= _MIN_REPORTED_MISSING
+        return f"{text}; {missed:.1%} of the light is missing" if is_told else text
 
 
 def _trial_samples(samples: int) -> int:
@@ -306,9 +306,9 @@ def cost(techniques: Candidate, counts: Counts) -> float:
     time = SEGMENT * counts.camera_rays + SHADOW * counts.tested
     if techniques.light_paths == 0:
         return time
-    time += _SUMS * counts.camera_rays + techniques.light_paths * _LIGHT_SEGMENT * counts.light_rays
-    of_connection = _CONNECTION * counts.camera_rays + _CONNECTED * counts.connected
+    time += SUMS * counts.camera_rays + techniques.light_paths * LIGHT_SEGMENT * counts.light_rays
+    of_connection = CONNECTION * counts.camera_rays + CONNECTED * counts.connected
     time += techniques.connections * of_connection
     if techniques.merges:
-        time += _GRID * techniques.light_paths * counts.light_rays + _LOOK * counts.looked
+        time += GRID * techniques.light_paths * counts.light_rays + LOOK * counts.looked
     return time

@@ -11,11 +11,12 @@ import numpy as np
 
 from ....images.box_filter import box_means
 from ....images.coarse_film import CoarseFilm
-from ....planning.benefit import gain_of, is_worth, trimmed_batches
-from ....planning.effect import Effect
-from ....planning.learner import Learner
+from ....planning import verdicts
+from ....planning.evidence import gain_of, trimmed_batches
 from ....planning.pixel_estimates import relative_scale
-from ....planning.promise import Promise
+from ....planning.prediction import Effect
+from ....planning.prediction_check import PredictionCheck
+from ....planning.trial import Rival, Trial
 from ....rendering.camera import film_extent
 from ....transport.estimator import CameraRays, Estimator, Sample
 from ....transport.numbers import Numbers, schedule_state
@@ -27,7 +28,7 @@ from ..path_tracer import camera_paths
 from ..photons.photon_history import HiddenLight
 from ..photons.photon_mapper import PhotonMapper
 from .candidates import Candidate
-from .light_paths import OF_CAMERA_PATHS, cost
+from .light_paths import cost
 from .path_moments import Counts
 from .technique_observer import TechniqueObserver
 
@@ -61,7 +62,7 @@ class PhotonChoice:
         return mapper() if self.techniques == PHOTONS else walk
 
 
-class PhotonTrial(Learner):
+class PhotonTrial(Trial):
     """Compares progressive photon mapping with camera paths, which have to find all light by
     themselves. Both take samples of a coarse film that are no part of the image.
 
@@ -83,16 +84,12 @@ class PhotonTrial(Learner):
 
     Attributes:
         samples: A pixel for each sample of a pass.
-        rival: The efficiency of camera paths with what else was learned for them, relative to those
-            of the trial.
-        leaves_out: If photons pay, these slots decide as ``path``.
-        can_be_guided: Are camera paths guided beside photons?
+        rival: What photons had to beat.
         variance, time: Those of photons, relative to ``path``, once the choice has been made.
-        promise: Tests the choice of camera paths; ``None`` if photons were chosen, since there are
+        check: Checks the choice of camera paths; ``None`` if photons were chosen, since there are
             no pilots after that.
     """
 
-    leaves_out = *OF_CAMERA_PATHS, "next_event"
     can_be_guided = False
 
     def __init__(self, film: mi.Film, spp: int) -> None:
@@ -104,10 +101,15 @@ class PhotonTrial(Learner):
         self._path: _Samples | None = _Samples(pixels)
         self._choice = PhotonChoice()
         self._mapper: PhotonMapper | None = None
-        self.samples, self.rival = coarse.samples, 1.0
+        self.samples, self.rival = coarse.samples, Rival()
         self.variance: float | None = None
         self.time: float | None = None
-        self.promise: Promise | None = None
+        self.check: PredictionCheck | None = None
+
+    @classmethod
+    def in_own_stage(cls, film: mi.Film, spp: int) -> PhotonTrial:
+        """A trial, which always has a stage of its own."""
+        return cls(film, spp)
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
@@ -119,7 +121,7 @@ class PhotonTrial(Learner):
         """The variance of what was chosen, relative to that of the samples before."""
         if self._choice.techniques != PHOTONS:
             return 1.0
-        return self.variance if self.promise is None else 1 / self.promise.variance
+        return self.variance if self.check is None else 1 / self.check.variance
 
     def estimator(self, walk: Walk, mapper: PhotonMapper) -> TrialPasses:
         """Takes the samples: ``walk`` those of camera paths, ``mapper`` those of photons, for the
@@ -130,10 +132,19 @@ class PhotonTrial(Learner):
         coarse = replace(coarse, light_walk=light_walk, observer=self._photons)
         return TrialPasses(walk, coarse, self._path)
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> PhotonChoice:
+    @property
+    def chosen_time(self) -> float:
+        return self.time if self._choice.techniques == PHOTONS else 1.0
+
+    def leaves_out(self, slot: str, finds_all_light: bool) -> bool:
+        # Photons bring all light: nothing is connected to lights
+        return finds_all_light or slot == "next_event"
+
+    def first_choice(self) -> PhotonChoice:
         return PhotonChoice(PHOTONS, self)
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> PhotonChoice:
+    def choose(self, rival: Rival) -> PhotonChoice | None:
+        self.rival = rival
         photons, path = np.array(self._photons.passes), np.concatenate(self._path.passes)
         image = photons.mean(axis=(0, 1)).reshape(-1, self._coarse.width)
         weight = relative_scale(image).ravel() ** 2
@@ -146,26 +157,23 @@ class PhotonTrial(Learner):
             / (cost(NO_PHOTONS, self._path.counts) / path.size)
         )  # fmt: skip
         # What was learned for camera paths seldom helps to hit a light
-        ratio, error = _ratio(of_photons, np.maximum(found / self.rival, hidden))
-        pays = is_worth(1 / (ratio * self.time), error, 1.0)
+        ratio, error = _ratio(of_photons, np.maximum(found / rival.efficiency, hidden))
+        pays = verdicts.is_worth(1 / (ratio * self.time), error, 1.0)
         self._choice = PhotonChoice(PHOTONS if pays else NO_PHOTONS)
         if not pays:
             # Pilots may hold none of the rare hits of hidden lights
             of_photons /= weight
-            self.promise = Promise(self._film, self._coarse, of_photons, self._hidden(), weight)
+            self.check = PredictionCheck(
+                self._film, self._coarse, of_photons, self._hidden(), weight
+            )
         # Frees what it holds
         self._mapper, self._photons, self._path = None, None, None
-        return self._choice
+        return self._choice if pays else None
 
-    def reconsider(self, time: float, margin: float) -> PhotonChoice | None:
+    def reconsider(self, rival: Rival, time: float, margin: float) -> PhotonChoice | None:
         """Photons, if camera paths with all that was learned for them have so much variance that
-        these are better; ``None`` if nothing changes.
-
-        Parameters:
-            time: The time of a camera path, in units of that of ``path``.
-            margin: The efficiency that photons must have, in units of that of camera paths.
-        """
-        if self.promise is None or not self.promise.is_broken(time / self.time, 1 / margin):
+        photons are better."""
+        if self.check is None or not self.check.failed(time / self.time, 1 / margin):
             return None
         self._choice = PhotonChoice(PHOTONS)
         return self._choice
@@ -200,7 +208,7 @@ class PhotonTrial(Learner):
 
     @property
     def effect(self) -> Effect:
-        about = {"rival": self.rival} if self.variance is not None else {}
+        about = {"rival": self.rival.efficiency} if self.variance is not None else {}
         about |= asdict(PHOTONS)
         if self._measured is not None:
             about["measured_variance"] = self._measured
@@ -218,9 +226,9 @@ class PhotonTrial(Learner):
     def _measured(self) -> float | None:
         """The variance of the pilots after the trial, relative to ``path``, if they had no photons.
         """
-        if self.promise is None or self.promise.variance is None:
+        if self.check is None or self.check.variance is None:
             return None
-        return self.promise.variance * self.variance
+        return self.check.variance * self.variance
 
 
 class _Samples(TechniqueObserver):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ....planning.benefit import gain_of, trimmed_batches
+from ....planning.evidence import gain_of, trimmed_batches
 from ....planning.pixel_estimates import relative_scale
 from .path_moments import Estimate
 

@@ -9,7 +9,6 @@ from typing import Any
 import mitsuba as mi
 
 from ....rendering.camera import film_extent
-from ....rendering.camera_samples import CameraSamples
 from ....scene.movers import movers
 from ..light_walk import LightWalk
 from ..photons.medium_photons import suitable_ball, widest_ball
@@ -18,13 +17,15 @@ from .merging_radius import MergingRadius
 from .shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
 
 
-def share_rays(camera: CameraSamples, scene: mi.Scene, seed: int) -> None:
-    """Gives sample k of each pixel the same time where things move, and the same wavelengths: only
-    paths that have these in common can be merged."""
+def shared_numbers(scene: mi.Scene, seed: int) -> dict[str, SharedNumbers]:
+    """Numbers, by slot, with which sample k of each pixel has the same time where things move, and
+    the same wavelengths: only paths that have these in common can be merged."""
+    shared = {}
     if movers(scene):
-        camera.time = SharedNumbers(TIME_STEP, seed, 1)
+        shared["time"] = SharedNumbers(TIME_STEP, seed, 1)
     if mi.is_spectral:
-        camera.wavelength = SharedNumbers(WAVELENGTH_STEP, seed, 2)
+        shared["wavelength"] = SharedNumbers(WAVELENGTH_STEP, seed, 2)
+    return shared
 
 
 @dataclass

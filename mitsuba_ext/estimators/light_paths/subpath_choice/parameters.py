@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 
-from ....planning.decision_parameters import DecisionParameters, Setting
 from ....planning.learner import Learner
 from ....planning.pixel_estimates import brightness
+from ....planning.technique import Setting, Technique
 from ....rendering.camera import film_extent
 from ....scene.movers import movers
 from ....scene.regions.surface_sides import lit_normal
@@ -24,7 +24,7 @@ from .region_learner import LightVertexSample, RegionLearner
 _PATHS = 1 << 15
 
 
-class LearnedSubpaths(DecisionParameters):
+class LearnedSubpaths(Technique):
     """Chooses light vertices by how much those of their region contributed in the pilots."""
 
     name = "visibility"

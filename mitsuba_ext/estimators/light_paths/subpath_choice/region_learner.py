@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ....planning.learner import Learner
+from ....planning.costs import SUBPATH_CHOICE
+from ....planning.learner import Learner, Pilot
 from ....planning.pixel_estimates import PixelEstimates
+from ....planning.prediction import Prediction
 from ....scene.regions.nested_regions import NestedRegions
-from ....transport.path_decisions import SubpathSelection
 from ....util.arrays import joined
 from ....util.stored_arrays import StoredArrays
 from .pair_records import PairRecords
@@ -30,11 +31,6 @@ _TESTS, _MOST_REGIONS = 2.0, 768
 
 #: About the number of recorded connections of a path.
 _CONNECTIONS = 3
-
-#: The relative reduction of variance that the first pilot must predict for learning to continue.
-#: The true one is about twice as large, because MIS weights then rely on the connections; a sample
-#: takes 1.2 times as long.
-_LEAST_GAIN = 0.12
 
 
 @dataclass
@@ -120,7 +116,7 @@ class RegionLearner(Learner):
 
     # ---- Between the stages ----
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> SubpathSelection | None:
+    def learn(self, pilot: Pilot) -> RegionTable | None:
         if self._records is None:
             return None
         records = self._records
@@ -129,20 +125,21 @@ class RegionLearner(Learner):
         self._tests += records.tests
         self._squares += records.squares * drawn**2
         self._probability = self._learned()
-        if self._gain is None:
-            self._gain = self._promise(drawn)
+        if is_first := self._gain is None:
+            self._gain = self._predicted_gain(drawn)
         self._summary = (
             f"{self._regions.count} regions of light vertices, at least about "
             f"{max(0.0, self._gain):.0%} less variance"
         )
-        if self._gain < _LEAST_GAIN:
+        prediction = Prediction(1 - self._gain, 1.0, overhead=SUBPATH_CHOICE)
+        if is_first and not pilot.pays(prediction):
             self._records = None
             self._summary = f"light vertices uniformly chosen: with {self._summary}"
-            return SubpathSelection()
+            return None
         records.restart()
         return self._table()
 
-    def _promise(self, drawn: np.ndarray) -> float:
+    def _predicted_gain(self, drawn: np.ndarray) -> float:
         """The relative reduction of variance by the new probabilities, for a pilot with the
         probabilities ``drawn`` and unchanged MIS weights."""
         squares = self._records.squares

@@ -13,7 +13,7 @@ from mitsuba_ext.estimators.light_paths.both_ends import FromBothEnds, from_both
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
 from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
-from mitsuba_ext.planning.decision_parameters import Setting
+from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
 from mitsuba_ext.scene.regions.surface_rows import SurfaceRows

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning.decision_parameters import Setting
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
+from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner, most_efficient
 from mitsuba_ext.techniques.guided_directions.path_records import BYTES_PER_RECORD, PathRecords

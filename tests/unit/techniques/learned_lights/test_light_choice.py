@@ -6,15 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_ext.techniques.shadow_rejection.light_map_roulette_learner import (
+    LightMapRouletteLearner,
+)
 
-from mitsuba_ext.planning.benefit import SEGMENT, SHADOW, TABLE
+from mitsuba_ext.planning.evidence import SEGMENT, SHADOW, TABLE
 from mitsuba_ext.scene.lights import weights as lights_weights
 from mitsuba_ext.scene.lights.choice import Choice
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
-from mitsuba_ext.techniques.shadow_rejection.light_map_roulette_learner import (
-    LightMapRouletteLearner,
-)
 from mitsuba_ext.transport.light_table import LightTable, OneRow
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 from tests.support.lights import ball

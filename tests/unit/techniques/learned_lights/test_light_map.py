@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_ext.techniques.shadow_rejection.light_map_roulette import LightMapRoulette
 
 from mitsuba_ext.planning.scout import Scout
 from mitsuba_ext.scene.lights.choice import Choice
@@ -17,7 +18,6 @@ from mitsuba_ext.scene.lights.shutter_times import ShutterTimes
 from mitsuba_ext.scene.regions.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.scene.regions.surface_sides import region
 from mitsuba_ext.techniques.learned_lights.light_map import LightMap
-from mitsuba_ext.techniques.shadow_rejection.light_map_roulette import LightMapRoulette
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.light_table import LightTable
 from tests.support.maps import (

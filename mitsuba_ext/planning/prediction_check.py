@@ -1,4 +1,4 @@
-"""Is what a trial has chosen as good as it has promised?"""
+"""Checks whether what a trial has chosen is as good as predicted."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from ..images.coarse_film import CoarseFilm
 from ..rendering.camera import film_extent, first_pixel
 from ..rendering.pass_images import PassImages
-from .benefit import gain_of, trimmed_batches
+from .evidence import gain_of, trimmed_batches
 from .pixel_estimates import relative_scale
 
 
-class Promise:
+class PredictionCheck:
     """Compares the variance of the stages after a trial, which use what it has chosen, to the error
     that it has predicted for what it has not chosen. (Other pilots would be no measure of ``path``:
     the rare paths that make most of its variance may be missing in them.)
@@ -29,7 +29,7 @@ class Promise:
 
     Attributes:
         images: The images of the stages after the trial.
-        variance: Their variance, relative to that error; ``None`` before :meth:`is_broken`.
+        variance: Their variance, relative to that error; ``None`` before :meth:`failed`.
         error: The standard error of its logarithm.
     """
 
@@ -46,7 +46,7 @@ class Promise:
         self.variance: float | None = None
         self.error = 0.0
 
-    def is_broken(self, time: float, rival: float) -> bool:
+    def failed(self, time: float, rival: float) -> bool:
         """Is what was chosen less efficient than its rival, by more than the error of this
         measurement?
 

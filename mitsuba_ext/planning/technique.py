@@ -1,16 +1,17 @@
-"""The parameters of a decision, as the scene gives them, and the decision or learner that they make
-for one render."""
+"""The base class of techniques: the parameters of a decision, as the scene gives them, and the
+decision or learner that they make for one render."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
 
 from ..rendering.camera import film_extent
+from ..transport.decisions import CAMERA_SLOTS, Decisions
 from ..util.parameters import read_parameter
 from .learner import Learner
 
@@ -25,7 +26,9 @@ class Setting:
         max_depth, rr_depth: Longest path in segments, and depth at which roulette begins.
         spp: Samples per pixel of the render.
         pilot_spp: How many of these are pilot samples.
-        is_timed: Can a timeout end the render before it has all samples?
+        is_timed: Whether a timeout can end the render before it has all samples.
+        plugin: The integrator's name in errors and warnings.
+        slot: The slot for which a decision is made.
     """
 
     scene: mi.Scene
@@ -36,6 +39,8 @@ class Setting:
     spp: int
     pilot_spp: int = 0
     is_timed: bool = False
+    plugin: str = ""
+    slot: str = ""
 
     @property
     def pixel_count(self) -> int:
@@ -87,7 +92,7 @@ class ParameterReader:
         return cls(plugin, mi.Properties(plugin), names, **defaults)
 
     def is_given(self, key: str) -> bool:
-        """Does the scene give this parameter?"""
+        """Whether the scene gives this parameter."""
         return self._names.get(key, key) in self._props
 
     def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
@@ -107,10 +112,10 @@ class ParameterReader:
 
 
 #: What fills the slots of an integrator.
-Slots = Mapping[str, "DecisionParameters"]
+Slots = Mapping[str, "Technique"]
 
 
-class DecisionParameters:
+class Technique:
     """The parameters of something that can replace one decision of the walk. One object serves all
     renders: it holds no state of any of them.
 
@@ -120,14 +125,22 @@ class DecisionParameters:
         pilot_spp: Pilot samples per pixel from which it learns, by default; 0 if it does not learn.
         pilot_paths: How many samples of the whole film are enough to learn from; 0 if more are
             always better.
-        doubles: Can it learn from one sample per pixel? Each pilot then has as many samples as all
-            before it.
-        tries: Does what it learns in a first pilot make the next ones better?
-        camera_paths_only: Does it need what only camera paths store at a vertex (from where it is
-            seen, its depth, the density with which BSDF sampling finds a light)?
-        sees_media: Can it decide at vertices in participating media? False if it needs a normal
-            or a BSDF.
-        sample_cost: The approximate time of a sample in units of that of a path.
+        doubles: Whether it can learn from one sample per pixel. Each pilot then has as many samples
+            as all before it, and its samples weigh less, the less was known.
+        tries: Whether what it learns in a first pilot makes the next ones better.
+        most_lanes: The most samples in a pass from which it learns, for the memory of what it
+            records; 0 for any number.
+        camera_paths_only: Whether it needs what only camera paths store at a vertex (from where it
+            is seen, its depth, the density with which BSDF sampling finds a light).
+        finds_all_light: Whether it is for camera paths that find all light alone: beside light
+            paths, it is left out.
+        sees_media: Whether it can decide at vertices in participating media. False if it needs a
+            normal or a BSDF.
+        tells_visibility: Whether it learns which lights a vertex sees, so that a shadow test can
+            use that (:meth:`~mitsuba_ext.planning.learner.Learner.shadow_test`).
+        sample_cost: The approximate time of a sample in units of the time of a path.
+        needs_equal_samples: Why all pixels must get the same number of samples, as the end of an
+            error message with ``{slot}``; empty if they need not.
     """
 
     name = ""
@@ -136,9 +149,13 @@ class DecisionParameters:
     pilot_paths = 0
     doubles = False
     tries = False
+    most_lanes = 0
     camera_paths_only = False
+    finds_all_light = False
     sees_media = True
+    tells_visibility = False
     sample_cost = 1
+    needs_equal_samples = ""
 
     def check_slot(self, plugin: str, slot: str) -> None:
         """
@@ -158,11 +175,15 @@ class DecisionParameters:
         """
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
-        """Is there something to learn in ``scene``, from ``spp`` pilot samples per pixel?"""
+        """Whether ``spp`` pilot samples per pixel can learn something in ``scene``."""
         return False
 
+    def samples_per_set(self, spp: int, is_timed: bool) -> int:
+        """How many of the ``spp`` samples of a pixel a timeout must not separate."""
+        return 1
+
     def decision(self, setting: Setting) -> Any | None:
-        """The decision without learning; ``None`` for that of Mitsuba's ``path``."""
+        """The decision without learning; ``None`` for the one of Mitsuba's ``path``."""
         return None
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
@@ -183,3 +204,29 @@ class DecisionParameters:
 
     def __str__(self) -> str:
         return self.describe()
+
+
+def check_has_wavelengths(plugin: str) -> None:
+    """
+    Raises:
+        RuntimeError: The variant has no wavelengths.
+    """
+    if not mi.is_spectral:
+        raise RuntimeError(
+            f'"{plugin}": the parameter "wavelength" does not work in the variant '
+            f'"{mi.variant()}", which has no wavelengths: use a spectral one, such as '
+            f'"llvm_ad_spectral".'
+        )
+
+
+def decisions_of(
+    techniques: Slots, setting: Setting, given: Decisions = Decisions()  # noqa: B008  (frozen)
+) -> Decisions:
+    """The decisions of techniques without learning, of camera paths; ``given`` are the decisions of
+    slots that they do not fill."""
+    made = {
+        slot: technique.decision(replace(setting, slot=slot))
+        for slot, technique in techniques.items()
+        if slot not in CAMERA_SLOTS
+    }
+    return replace(given, **{slot: x for slot, x in made.items() if x is not None})

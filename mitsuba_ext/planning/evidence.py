@@ -1,4 +1,4 @@
-"""Is a learned decision worth its time?
+"""What pilots tell about the efficiency of a learned decision.
 
 The benefit of a decision is the ratio of the efficiencies, 1 / (variance · time), with it and
 without. Variance and time are estimated from pilots:
@@ -17,16 +17,6 @@ The prior is that efficiency does not change. It weighs more, the less certain a
 from __future__ import annotations
 
 import numpy as np
-
-#: The time of a segment of a path (its ray, its BSDF, the choice of a light), of the shadow ray,
-#: and of choosing the light from a table, in arbitrary units. (A fit to light paths, see
-#: ``light_paths.py``, and to ten scenes with a table: predictions within 0.06 of the measured time,
-#: but in showroom, where paths with the table take 0.88 of the time.)
-SEGMENT, SHADOW, TABLE = 1.35, 0.5, 0.05
-
-#: The cost of guiding the first direction of a path, and each further one, in units of the time of
-#: a ray (medians over 15 scenes; the first: 0.3 to 1).
-FIRST_GUIDED, GUIDED = 0.7, 0.25
 
 #: The number of batches of paths; one path in ``TRIM`` is left out.
 BATCHES, TRIM = 32, 1 << 15
@@ -86,8 +76,3 @@ def expected_gain(efficiency: float, error: float) -> float:
     if efficiency <= 0:
         return -np.inf
     return _PRIOR**2 / (_PRIOR**2 + error**2) * float(np.log(efficiency))
-
-
-def is_worth(efficiency: float, error: float, least: float) -> bool:
-    """Is the expected efficiency (:func:`expected_gain`) at least ``least``?"""
-    return expected_gain(efficiency, error) >= np.log(least)

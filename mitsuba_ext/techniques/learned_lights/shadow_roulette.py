@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.path_decisions import ShadowTest
-from ..learned_lights.light_map import LightMap
-from .rejection_law import RejectionLaw, rejected_share
+from ...transport.rejection_law import RejectionLaw, rejected_share
+from .light_map import LightMap
 
 
 class LightMapRoulette(ShadowTest):
@@ -16,15 +16,15 @@ class LightMapRoulette(ShadowTest):
 
     Parameters:
         light_map: The learned map. The next event decision must choose from its rows and cells.
-        slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
+        law: The probability of a test.
 
     Attributes:
         rejected_share (float): Share of the pilots' shadow rays that the roulette would not trace.
     """
 
-    def __init__(self, light_map: LightMap, slope: float, floor: float, law: str) -> None:
+    def __init__(self, light_map: LightMap, law: RejectionLaw) -> None:
         self._count = dr.opaque(mi.UInt32, light_map.cells.count)
-        self._p = RejectionLaw(law, slope, floor).probability(
+        self._p = law.probability(
             light_map.ratio, light_map.visibility
         )
         dr.eval(self._p)

@@ -7,11 +7,38 @@ from typing import Any
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """What pilots predict of a learned decision, relative to that of ``path``.
+
+    Attributes:
+        variance: The variance with it, divided by the variance without it.
+        time: The time of a sample with it, divided by the time without it.
+        error: The standard error of the logarithm of ``variance``.
+        share: The share of all pilots' samples from which it was found. A small one is a trial: it
+            tells whether learning should continue.
+        grows: Whether more samples make the decision better.
+        overhead: What it takes besides the time of a sample, as a share of that.
+    """
+
+    variance: float
+    time: float
+    error: float = 0.0
+    share: float = 1.0
+    grows: bool = False
+    overhead: float = 0.0
+
+    @property
+    def efficiency(self) -> float:
+        """1 / (variance · time)."""
+        return 1 / (max(self.variance, 1e-3) * self.time * (1 + self.overhead))
+
+
+@dataclass(frozen=True)
 class Effect:
     """The effect of a learned decision, relative to that of ``path``, as far as pilots can tell.
 
     Attributes:
-        is_kept: Does the last stage use it?
+        is_kept: Whether the last stage uses it.
         variance: The variance of the last stage with it, divided by the variance without it;
             ``None`` where it was not measured. For a decision that is not kept, this and ``time``
             are the reason.

@@ -15,11 +15,6 @@ import mitsuba as mi
 #: Initial value of a map entry in the paper; with its law, the least probability of a test.
 PAPER_EPSILON = 1e-4
 
-#: Share of rejected shadow rays below which the lookups cost more time than the rejection saves. By
-#: this measure staircase has 0.05, kitchen 0.07 (which about breaks even), veach-ajar 0.2,
-#: door_ajar 0.5.
-WORTHWHILE = 0.05
-
 #: Probabilities are rounded to this fixed point where they are summed.
 _UNITS = 1024
 

@@ -1,0 +1,125 @@
+"""How many samples pilots take, and how much these weigh in the image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mitsuba as mi
+import numpy as np
+
+from .technique import Technique
+
+#: Where each pilot has as many samples as all before it, pilots may have half of all samples from
+#: this number of samples per pixel on, as they then cost little; below, a quarter.
+_MANY_SAMPLES = 8
+
+#: Approximate number of paths of each of the first two pilots, which measure the benefit of
+#: learning.
+_TRIAL_PATHS = 1 << 17
+
+#: The largest relative rise of variance, by unequal weights of samples, where no map helps.
+_MOST_LOSS = 0.015
+
+#: Where maps help, a sample that is drawn from a map of n samples per pixel is worth about
+#: (n + _UNIFORM) / (n + _HALF) of one that is drawn from a perfect map.
+_UNIFORM, _HALF = 0.1, 1.5
+
+#: The first sample of all pixels is divided into stages until the first of them takes no more than
+#: this share of all samples, as these are drawn from uniform numbers. It has at least this number
+#: of pixels: Dr.Jit's tracing of a stage takes as long as the paths of as many.
+_FIRST_SHARE, _LEAST_PIXELS = 1 / 32, 1 << 13
+
+
+def pilot_samples(
+    slots: Mapping[str, Technique],
+    scene: mi.Scene,
+    pixel_count: int,
+    spp: int,
+    pilot_spp: int,
+) -> list[int]:
+    """The samples per pixel of each pilot.
+
+    Pilots have at most a quarter of all samples, as more of them gain little; half where each pilot
+    doubles the samples (``Technique.doubles``). The first two pilots are short trials: if
+    learning does not pay off, little time has been spent. The later pilots already use what was
+    learned from all before them.
+
+    Parameters:
+        slots: The techniques that fill the slots of the walk.
+        scene: The scene.
+        pixel_count: Sampled pixels of the film.
+        spp: Samples per pixel of the render.
+        pilot_spp: Samples per pixel of all pilots, as the scene asks for them.
+    """
+    samples = min(pilot_spp, spp // 4)
+    learning = [t for t in slots.values() if t.pilot_spp and t.can_learn(scene, samples)]
+    if not learning:
+        return []
+    if all(technique.pilot_paths for technique in learning):
+        enough = max(technique.pilot_paths for technique in learning)
+        # At least two samples of a pixel, to estimate their variance
+        samples = min(samples, max(2, -(-enough // pixel_count)))
+    if all(technique.doubles for technique in learning):
+        return doubling_pilots(min(pilot_spp, spp // 2 if spp >= _MANY_SAMPLES else spp // 4))
+    if samples < 3 or all(not technique.tries for technique in learning):
+        return [samples]
+    quarter = samples // 4 or 1
+    trial = max(1, _TRIAL_PATHS // pixel_count)
+    if 2 * trial > quarter:
+        return [quarter, quarter, samples - 2 * quarter]
+    rest = samples - 2 * trial
+    return [trial, trial, quarter, rest - quarter]
+
+
+def doubling_pilots(samples: int) -> list[int]:
+    """The samples per pixel of each pilot: one, and then as many as in all pilots before it."""
+    pilots = [1]
+    while 2 * sum(pilots) <= samples:
+        pilots.append(sum(pilots))
+    pilots[-1] += samples - sum(pilots)
+    return pilots
+
+
+def first_parts(pixel_count: int, spp: int) -> int:
+    """Into how many stages the first of ``spp`` samples of all pixels is divided."""
+    parts = 1
+    while 0.5 ** (parts - 1) > _FIRST_SHARE * spp and pixel_count >> parts >= _LEAST_PIXELS:
+        parts += 1
+    return parts
+
+
+def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
+    """For each stage, the weight of its samples relative to those of the last stage. Where maps
+    help much, equal weights would leave most of the noise to samples of the first stages. Where
+    maps do not help, unequal weights raise the variance by 1.5 % at most, which limits them.
+
+    Parameters:
+        stages: Samples per pixel of each stage.
+        parts: Into how many stages the first one is divided.
+    """
+    count = len(stages) + parts - 1
+    # The share of the pixels in each part of the first stage
+    shares = [0.5 ** (parts - max(part, 1)) for part in range(parts)] if parts > 1 else [1.0]
+    known = np.cumsum([0.0, *(stages[0] * share for share in shares), *stages[1:]])[:count]
+    wanted = (known + _UNIFORM) / (known + _HALF)
+    wanted = list(wanted / wanted[-1])
+
+    def weights(share: float) -> list[float]:
+        return [1 - share * (1 - weight) for weight in wanted]
+
+    def loss_of_pixel(first: float, others: Sequence[float]) -> float:
+        pairs = [(stages[0], first), *zip(stages[1:], others)]
+        mean = sum(n * w for n, w in pairs)
+        return sum(stages) * sum(n * w * w for n, w in pairs) / mean**2 - 1
+
+    def loss(share: float) -> float:
+        every = weights(share)
+        return sum(s * loss_of_pixel(every[k], every[parts:]) for k, s in enumerate(shares))
+
+    low, high = 0.0, 1.0
+    if loss(high) <= _MOST_LOSS:
+        return weights(high)
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if loss(middle) <= _MOST_LOSS else (low, middle)
+    return weights(low)

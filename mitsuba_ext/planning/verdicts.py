@@ -1,0 +1,95 @@
+"""Whether what was learned is worth its time: every threshold of efficiency, in one place.
+
+Efficiency is 1 / (variance · time), relative to the decision of ``path``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from .evidence import expected_gain
+from .prediction import Prediction
+
+#: The efficiency that a learned decision must reach to be used.
+LEAST = 1.03
+
+#: The efficiency that it must reach in a trial for learning to continue; and the same for decisions
+#: that more samples make better.
+TRIAL, GROWING_TRIAL = 1.0, 0.95
+
+#: The share of all pilots' samples below which a prediction is a trial.
+ENOUGH = 0.2
+
+#: The efficiency that the first map of lights must predict for a finer map to follow.
+REFINING = 1.2
+
+#: The share of a render's time that the first map of lights may take, and a finer one.
+FIRST_MAP_SHARE, FINER_MAP_SHARE = 0.05, 1 / 3
+
+#: What light paths must gain, besides the time to compile their kernels.
+LIGHT_PATHS = 1.1
+
+#: Pilots are left out of the image if later stages have less than this part of their variance: at
+#: equal weights, a quarter of all samples then adds more noise than it removes.
+FAR_LESS = 0.4
+
+#: The efficiency of guides that are learned from all pilots, relative to that which short ones
+#: predict (door_ajar: 1.8 and 1.4).
+GUIDES_GROW = 1.25
+
+#: Guided directions are expected to keep this power of their efficiency beside light paths. (The
+#: first pilots with both have guides of few samples, and show less.)
+_KEPT_BESIDE = 0.5
+
+
+def is_trial(share: float, is_last: bool) -> bool:
+    """Whether a prediction from this share of the pilots' samples decides only if learning
+    continues. ``is_last``: no pilot follows."""
+    return share < ENOUGH and not is_last
+
+
+def least(prediction: Prediction, is_last: bool) -> float:
+    """The efficiency that a decision must reach."""
+    if not is_trial(prediction.share, is_last):
+        return LEAST
+    return GROWING_TRIAL if prediction.grows else TRIAL
+
+
+def pays(prediction: Prediction, is_last: bool) -> bool:
+    """Whether the expected efficiency of a decision is high enough. A trial need not be certain."""
+    error = 0.0 if is_trial(prediction.share, is_last) else prediction.error
+    return is_worth(prediction.efficiency, error, least(prediction, is_last))
+
+
+def is_worth(efficiency: float, error: float, least: float) -> bool:
+    """Whether the expected efficiency is at least ``least``. ``error`` is the standard error of the
+    logarithm of ``efficiency``."""
+    return expected_gain(efficiency, error) >= np.log(least)
+
+
+def beside_light_paths(efficiency: float) -> float:
+    """The efficiency that guided directions are expected to keep beside light paths."""
+    return efficiency**_KEPT_BESIDE
+
+
+def best(
+    efficiencies: np.ndarray, errors: Sequence[float], rival: float, guided: Sequence[float]
+) -> tuple[int, int]:
+    """The candidate of the highest expected efficiency, and the best one except the first.
+
+    Parameters:
+        efficiencies: Efficiency of each candidate; the first is ``path``. The prior is that it is
+            the efficiency of the second one.
+        errors: Standard errors of the logarithms of their ratios to the second one.
+        rival: The efficiency of what was learned for ``path``, relative to ``path``.
+        guided: For each candidate, the efficiency that guided directions add to it.
+    """
+    efficiencies = efficiencies / efficiencies[1]
+    efficiencies[0] *= rival
+    gains = [expected_gain(*x) for x in zip(efficiencies, errors)]
+    other = 1 + int(np.argmax(gains[1:]))
+    gains[other] += math.log(guided[other])
+    return (other if gains[other] > gains[0] else 0), other

@@ -1,0 +1,112 @@
+"""The decisions with which a render takes its samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import mitsuba as mi
+
+from .numbers import Numbers
+from .path_decisions import (
+    ConnectionCount,
+    DirectionSamples,
+    EmitterSampling,
+    Roulette,
+    Scattering,
+    SceneQuery,
+    ShadowTest,
+    SubpathSelection,
+    Weights,
+)
+
+
+class PixelNumbers(Protocol):
+    """A source of numbers for one purpose."""
+
+    def draw(
+        self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
+    ) -> tuple[Any, ...]:
+        """The number for sample ``index`` (among all of the render) of each pixel, and its weight
+        (or two weights). ``sampler`` is that of the sensor."""
+
+
+@dataclass(frozen=True)
+class CameraSamples:
+    """The sources of the numbers of camera rays. ``None`` stands for the sensor's sampler, as in
+    Mitsuba.
+
+    Attributes:
+        aperture: Chooses points of the aperture, in two dimensions.
+        time: Chooses times in the shutter interval.
+        wavelength: Chooses the four wavelengths u + k/4. Its draws have a second weight, for
+            radiance that all four wavelengths carry: the density of u then has the period 1/4.
+        distance: Chooses the first distance of a path in a homogeneous medium.
+    """
+
+    aperture: PixelNumbers | None = None
+    time: PixelNumbers | None = None
+    wavelength: PixelNumbers | None = None
+    distance: PixelNumbers | None = None
+
+
+class WarpedLights(Protocol):
+    """Warps the numbers that choose a light and a point on it."""
+
+    def around(self, next_event: EmitterSampling) -> EmitterSampling:
+        """``next_event``, with warped numbers."""
+
+
+@dataclass(frozen=True)
+class Decisions(CameraSamples):
+    """The decisions of a stage, one for each slot of an integrator. ``None`` stands for the one
+    of Mitsuba's ``path``.
+
+    Attributes:
+        directions: Which primary samples choose the lobe and the direction of a BSDF sample.
+        scattering: In which direction a path continues.
+        next_event: Which point of which light to connect to.
+        light_numbers: Warps the primary samples of ``next_event``.
+        roulette: With which probability a path continues.
+        connections: To how many points on lights a vertex is connected.
+        mis: The MIS weights of connections and of scattering.
+        shadow_test: Whether the shadow ray of a connection is traced.
+        query: How rays intersect the scene.
+        subpath_selection: Which vertices of light paths a vertex is connected to.
+        light_paths: How many light paths are traced, and what is done with them (only integrators
+            with light paths know its type).
+    """
+
+    directions: DirectionSamples | None = None
+    scattering: Scattering | None = None
+    next_event: EmitterSampling | None = None
+    light_numbers: WarpedLights | None = None
+    roulette: Roulette | None = None
+    connections: ConnectionCount | None = None
+    mis: Weights | None = None
+    shadow_test: ShadowTest | None = None
+    query: SceneQuery | None = None
+    subpath_selection: SubpathSelection | None = None
+    light_paths: Any = None
+
+    @property
+    def camera(self) -> CameraSamples:
+        """The sources of the numbers of camera rays alone."""
+        return CameraSamples(**{name: getattr(self, name) for name in CAMERA_SLOTS})
+
+    def of_walk(self) -> dict[str, Any]:
+        """The parameters of a :class:`~mitsuba_ext.transport.walk.Walk` that these decide."""
+        chosen = {name: getattr(self, name) for name in _WALK_SLOTS}
+        if self.light_numbers is not None:
+            chosen["next_event"] = self.light_numbers.around(self.next_event or EmitterSampling())
+        return {name: decision for name, decision in chosen.items() if decision is not None}
+
+
+#: The slots of camera rays.
+CAMERA_SLOTS = tuple(field.name for field in fields(CameraSamples))
+
+#: The slots that a walk has.
+_WALK_SLOTS = (
+    "directions", "scattering", "next_event", "roulette", "connections", "mis", "shadow_test",
+    "query",
+)  # fmt: skip
