@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.bases.decision_plugin import DecisionPlugin
-from mitsuba_ext.planning.learner import Learner
+from mitsuba_ext.planning.learner import Learner, Pilot
 from mitsuba_ext.planning.technique import ParameterReader, Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.spectra import brightness
@@ -44,7 +44,7 @@ class ProvenLights(Learner):
         brought = dr.minimum(brightness(value), 1e3)
         dr.scatter_add(self._sums, mi.UInt64(brought * UNIT), choice.cell, visible)
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> LightTable:
+    def learn(self, pilot: Pilot) -> LightTable:
         return self._table(self._sums.numpy().astype(float))
 
     def state(self) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
 from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.bsdfs import has_clear_curves
@@ -34,10 +35,6 @@ from mitsuba_ext.transport.observer import Observer
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
-
-#: Renders of fewer samples learn nothing: the fixed cost of learning exceeds the time that ``path``
-#: needs for the whole image. Compiling its kernels takes ten times as long.
-LEAST_SAMPLES = 1 << 18
 
 
 @registry.plugin
@@ -168,11 +165,11 @@ class Auto(LightPathIntegrator):
 
     def plan_learning(self, scene, sensor, spp, kernels=math.inf):
         pixel_count = math.prod(film_extent(sensor.film()))
-        is_short = pixel_count * spp < LEAST_SAMPLES
+        is_short = pixel_count * spp < verdicts.LEAST_SAMPLES
         is_short &= not (self.save_learned or self.keep_learned)
         plan = super().plan_learning(scene, sensor, 0 if is_short else spp, kernels)
         if is_short and plan.restore is None:
-            remark = f"nothing: with fewer than {LEAST_SAMPLES} samples, it is path"
+            remark = f"nothing: with fewer than {verdicts.LEAST_SAMPLES} samples, it is path"
             plan = replace(plan, remark=remark)
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
@@ -203,7 +200,7 @@ class Auto(LightPathIntegrator):
         return choice.estimator(self.walk(decisions, observer), mapper)
 
     def parameters(self):
-        learns_from = f"{LEAST_SAMPLES} samples (with fewer, it is path)"
+        learns_from = f"{verdicts.LEAST_SAMPLES} samples (with fewer, it is path)"
         return {**super().parameters(), "learns_from": learns_from}
 
     def merging_radius(self, scene, sensor, side, *sums):

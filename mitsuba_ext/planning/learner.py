@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,16 +21,14 @@ class Pilot:
     Attributes:
         scene: The scene.
         is_last: Whether the next stage is the last one.
-        judge: Says whether a decision is worth its time.
     """
 
     scene: mi.Scene
     is_last: bool
-    judge: Callable[[Prediction, bool], bool] = verdicts.pays
 
     def pays(self, prediction: Prediction) -> bool:
         """Whether a decision is worth its time; in a trial, whether it may be with more samples."""
-        return self.judge(prediction, self.is_last)
+        return verdicts.pays(prediction, self.is_last)
 
 
 class Learner(Observer):

@@ -13,6 +13,11 @@ import numpy as np
 from .evidence import expected_gain
 from .prediction import Prediction
 
+#: Renders of fewer samples, which choose by themselves what to learn, learn nothing: the fixed cost
+#: of learning exceeds the time that ``path`` needs for the whole image. Compiling its kernels takes
+#: ten times as long.
+LEAST_SAMPLES = 1 << 18
+
 #: The efficiency that a learned decision must reach to be used.
 LEAST = 1.03
 

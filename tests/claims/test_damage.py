@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.estimators.light_paths.subpath_choice import region_learner
 from mitsuba_ext.long_renders.bundle import Bundle, _digest
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.state import Batch, BatchResult, RenderState
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering.totals import RenderTotals
 from mitsuba_ext.techniques.learned_lights import light_map_file
 from mitsuba_ext.util import archives
@@ -180,7 +180,9 @@ def _saved(name: str, scene: mi.Scene, file: Path) -> dict[str, Any]:
 def _restore(plugin: dict[str, Any], scene: mi.Scene) -> None:
     """Reads what was learned, as a render does before its first sample."""
     integrator = mi.load_dict(plugin)
-    integrator.schedule(scene, scene.sensors()[0], (4,), 5).next_stage()
+    sensor = scene.sensors()[0]
+    plan = integrator.plan_learning(scene, sensor, 4)
+    integrator.schedule(scene, sensor, (4,), 5, plan).next_stage()
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -204,7 +206,7 @@ def test_a_damaged_learned_file_is_refused_or_is_the_same(tmp_path: Path, count:
 def test_edited_learned_files_are_refused_or_render(
     tmp_path: Path, name: str, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(region_learner, "_LEAST_GAIN", -np.inf)  # of light vertices
+    monkeypatch.setattr(verdicts, "pays", lambda *_: True)
     changes = {"sky": {"type": "constant"}} if name == "two stages" else {}
     scene, file = _scene(**changes), tmp_path / "learned.npz"
     plugin = _saved(name, scene, file)

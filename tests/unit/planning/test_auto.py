@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.bases import light_path_schedule
 from mitsuba_ext.estimators.light_paths.choice import light_paths
+from mitsuba_ext.planning import planner, verdicts
 from tests.support.emitters_and_materials import EMITTERS, below_the_lamp
 from tests.support.fogs import fog
 from tests.support.stage import stage
@@ -62,7 +62,7 @@ def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> Non
 def test_guides_that_paid_are_learned_again_beside_light_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0.0)
+    monkeypatch.setattr(planner, "LIGHT_PATH_KERNELS", 0.0)
     integrator = auto()
     scene = load("corridor", width=96, height=54)
     text = learned(scene, 64, integrator)
@@ -82,7 +82,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
-    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
         auto().render(scene, spp=32, seed=1)
@@ -116,7 +116,7 @@ def test_light_paths_take_the_place_of_maps_and_keep_the_mean(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Although the render is short
-    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0)
+    monkeypatch.setattr(planner, "LIGHT_PATH_KERNELS", 0)
     ball = {"type": "sphere", "center": [-0.3, 0, 0.5], "radius": 0.4,
             "bsdf": {"type": "dielectric"}}  # fmt: skip
     camera = below_the_lamp()
@@ -149,7 +149,7 @@ def test_short_renders_learn_nothing() -> None:
 def test_where_light_paths_cannot_be_tried_it_is_auto_path(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
     scene = mi.load_dict(fog("area"))
     images = []
     for name in ("auto", "auto_path"):
@@ -187,7 +187,7 @@ def test_samples_before_light_paths_are_left_out_where_these_have_far_less_varia
     scene = load("caustic", width=96, height=54)
     weights, images = [], []
     for least in (0.4, 0.0):
-        monkeypatch.setattr(light_path_schedule, "_FAR_LESS", least)
+        monkeypatch.setattr(verdicts, "FAR_LESS", least)
         images.append(np.array(auto().render(scene, spp=64, seed=4)))
         weights.append(np.array(scene.sensors()[0].film().develop(raw=True))[..., -1].mean())
     assert weights[0] < 0.95 * weights[1]

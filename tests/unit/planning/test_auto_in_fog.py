@@ -8,10 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.bases import light_path_schedule
 from mitsuba_ext.estimators.light_paths.choice import photon_trial
 from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonTrial
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.prediction_check import PredictionCheck
+from mitsuba_ext.planning.trial import Rival
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES
 from tests.support.fogs import cube, fog, homogeneous
 from tests.support.stage import area, lookat
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
     monkeypatch.setattr(photon_trial, "_LEAST", 1 << 14)
     monkeypatch.setattr(photon_trial, "_SAMPLES", 1 << 11)
 
@@ -57,12 +58,12 @@ def test_photons_render_light_that_camera_paths_miss(tmp_path) -> None:
 
 
 def test_photons_replace_camera_paths_of_more_variance(monkeypatch: pytest.MonkeyPatch) -> None:
-    def failed(promise: PredictionCheck, time: float, rival: float) -> bool:
-        assert promise.images.count >= FEWEST_PASSES and time < 1 and rival < 1
-        promise.variance = 100.0
+    def failed(check: PredictionCheck, time: float, rival: float) -> bool:
+        assert check.images.count >= FEWEST_PASSES and time < 1 and rival < 1
+        check.variance = 100.0
         return True
 
-    monkeypatch.setattr(photon_trial, "is_worth", lambda *_: False)
+    monkeypatch.setattr(verdicts, "is_worth", lambda *_: False)
     monkeypatch.setattr(PredictionCheck, "failed", failed)
     scene, auto = mi.load_dict(beam_through_glass()), make()
     found = image(auto, scene)
@@ -88,14 +89,14 @@ def test_photons_tell_the_second_moment_of_camera_paths_that_hit_lamps_in_glass(
         "type": "scene", "around": {**homogeneous(), "id": "around"}, **fog(), "light": lamp,
         "fog": cube({"type": "ref", "id": "around"}), "glass": glass, "air": air,
     }, optimize=False)  # fmt: skip
-    moments, learn = [], PhotonTrial.learn
+    moments, choose = [], PhotonTrial.choose
 
-    def learned(trial: PhotonTrial, scene: mi.Scene, is_last: bool) -> Any:
+    def chosen(trial: PhotonTrial, rival: Rival) -> Any:
         path = np.concatenate(trial._path.passes)
         moments.append((trial._hidden(), np.mean(path**2, axis=0)))
-        return learn(trial, scene, is_last)
+        return choose(trial, rival)
 
-    monkeypatch.setattr(PhotonTrial, "learn", learned)
+    monkeypatch.setattr(PhotonTrial, "choose", chosen)
     monkeypatch.setattr(photon_trial, "_PATH_PASSES", 64)
     image(make(), scene)
     hidden, found = (values.reshape(16, 16) for values in moments[0])

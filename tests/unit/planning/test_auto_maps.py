@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 
-from mitsuba_ext.rendering.plan import RenderPlan
+from mitsuba_ext.rendering.plan import Learning, RenderPlan
 from tests.support.statistical import assert_same_image, batches, load
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -35,8 +35,8 @@ def test_auto_path_is_the_same_where_no_ray_has_such_numbers() -> None:
 
 def test_passes_from_which_maps_are_learned_are_short_in_large_films() -> None:
     pixels = 1920 * 1080
-    plan = RenderPlan(0, 64, (32, 32), pixels, False, 16, 1)
+    plan = RenderPlan(0, 64, (32, 32), Learning(), pixels, False, 16, 1)
     assert plan.pass_length(32) == 16
     assert plan.pass_length(32, 2 * pixels + 1) == 2
     assert plan.pass_length(32, pixels // 2) == 1
-    assert RenderPlan(0, 64, (32, 32), pixels, True, 8, 1).pass_length(32, pixels) == 8
+    assert RenderPlan(0, 64, (32, 32), Learning(), pixels, True, 8, 1).pass_length(32, pixels) == 8

@@ -11,10 +11,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.bases import light_path_schedule
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering.stages import EndingSchedule
 from mitsuba_ext.util.arrays import add_own, channel_mean
 from tests.support.stage import area, stage
 
@@ -81,7 +80,6 @@ def test_learning_ends_when_it_has_taken_its_share_of_the_time(monkeypatch):
 
     def slow(*arguments):
         made = schedule(*arguments)
-        assert isinstance(made, EndingSchedule)
         next_stage = made.next_stage
 
         def delayed():
@@ -151,14 +149,15 @@ def test_learning_begins_only_where_there_is_time_to_compile():
     integrator, scene = _integrator("auto"), _scene()
     film = {"type": "hdrfilm", "width": 256, "height": 256}
     sensor = mi.load_dict({"type": "perspective", "film": film})
-    assert integrator.pilots(scene, sensor, 64, 20) and integrator._has_trial
-    assert integrator.pilots(scene, sensor, 64, 8) and not integrator._has_trial
-    assert not integrator.pilots(scene, sensor, 64, 4)
+    plans = [integrator.plan_learning(scene, sensor, 64, kernels) for kernels in (20, 8, 4)]
+    assert [(bool(plan.pilots), plan.tries) for plan in plans] == [
+        (True, True), (True, False), (False, False)
+    ]
 
 
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
 def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
-    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
     scene, compiled = _scene(), []
     for spp in (32, 64, 48, 80):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -12,7 +12,8 @@ import pytest
 
 from mitsuba_ext.rendering import interrupts, plan
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering.stages import Stage
+from mitsuba_ext.rendering.plan import Learning
+from mitsuba_ext.rendering.stages import Schedule, Stage
 from mitsuba_ext.transport.estimator import Sample
 from tests.support.clock import PassClock
 from tests.support.stage import stage
@@ -59,7 +60,7 @@ class _Constant:
         return Sample(mi.Color3f(self.value), mi.Bool(True), zero, zero, zero)
 
 
-class _Schedule:
+class _Schedule(Schedule):
     """Stages that are there beforehand."""
 
     def __init__(self, *stages: Stage) -> None:
@@ -67,6 +68,12 @@ class _Schedule:
 
     def next_stage(self) -> Stage:
         return next(self._stages)
+
+    def divide_first_stage(self, pixel_count: int) -> int:
+        return 1
+
+    def end_learning(self) -> None:
+        pass
 
 
 class _TwoStages:
@@ -77,8 +84,8 @@ class _TwoStages:
         self.progress, self.is_cancelled = None, False
         self.name, self.sample_cost, self.most_lanes = "two_stages", 1, 2**32 - 1
 
-    def pilots(self, scene, sensor, spp):
-        return [self.pilot_spp]
+    def plan_learning(self, scene, sensor, spp):
+        return Learning((self.pilot_spp,))
 
     def samples_per_set(self, spp):
         return 1
@@ -86,7 +93,7 @@ class _TwoStages:
     def pace_stage(self, scene, sensor, spp):
         return None
 
-    def schedule(self, scene, sensor, samples, seed):
+    def schedule(self, scene, sensor, samples, seed, learning):
         return _Schedule(Stage(_Constant(1.0)), Stage(_Constant(3.0), "something"))
 
     def aov_names(self):
@@ -102,7 +109,7 @@ class _TwoStages:
 @pytest.mark.parametrize("can_be_frozen", [False, True])
 def test_samples_of_a_stage_count_in_the_film_as_its_weight_says(scene, can_be_frozen):
     class Weighted(_TwoStages):
-        def schedule(self, scene, sensor, samples, seed):
+        def schedule(self, scene, sensor, samples, seed, learning):
             first, second = (_Constant(value, can_be_frozen) for value in (1.0, 3.0))
             return _Schedule(Stage(first, weight=0.25), Stage(second))
 

@@ -38,7 +38,7 @@ def _integrator(shift: tuple[int, int] | None, **parameters: Any) -> mi.Integrat
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 3, **parameters})
     if shift is not None:
         make = integrator.walk
-        integrator.walk = lambda **decisions: _Moved(make(**decisions), shift)
+        integrator.walk = lambda *arguments: _Moved(make(*arguments), shift)
     return integrator
 
 

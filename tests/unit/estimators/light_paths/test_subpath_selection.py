@@ -14,9 +14,9 @@ from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.light_vertices import PackedVertices, VertexCache
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
-from mitsuba_ext.estimators.light_paths.subpath_choice import region_learner
 from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
 from mitsuba_ext.estimators.light_paths.vertex_choice import RegionChoice
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
 from mitsuba_ext.scene.regions.surface_sides import lit_normal
 from mitsuba_ext.transport.path_decisions import EmitterSampling
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 @pytest.fixture
 def always(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learning goes on also where it does not pay."""
-    monkeypatch.setattr(region_learner, "_LEAST_GAIN", -np.inf)
+    monkeypatch.setattr(verdicts, "pays", lambda *_: True)
 
 
 def wall() -> dict[str, Any]:

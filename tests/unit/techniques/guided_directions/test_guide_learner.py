@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.planning.learner import Pilot
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
 from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
@@ -16,7 +17,6 @@ from mitsuba_ext.techniques.guided_directions.learner import GuideLearner, most_
 from mitsuba_ext.techniques.guided_directions.path_records import BYTES_PER_RECORD, PathRecords
 from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
 from mitsuba_ext.techniques.guided_directions.tile_regions import TileRegions
-from mitsuba_ext.transport.path_decisions import DirectionSamples
 from tests.support.maps import vertex_at
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor
 
@@ -87,13 +87,13 @@ def test_gain_of_each_share_is_that_of_its_density() -> None:
     """Relative errors count; what the pilots before have drawn does not."""
     learner = _learner(_Listening, always=True)
     _pilot(learner, 1)
-    learner.learn(None, is_last=False)
+    learner.learn(Pilot(None, False))
     for pilot in range(2):
         guide = learner.guide
         share = guide.trees.share.numpy().max()
         assert share == pytest.approx(learner.guidance.share if learner.guidance else 0.6)
         _pilot(learner, 2 + pilot)
-        learner.learn(None, is_last=pilot == 1)
+        learner.learn(Pilot(None, pilot == 1))
         pixel, u = _pixels(), _Numbers(10).next_2d()
         state = guide.begin(None, None, pixel)
         first = guide.draw(state, _Numbers(11), vertex_at(0), mi.Bool(True))
@@ -133,9 +133,9 @@ def test_a_guide_that_does_not_pay_is_given_up_unless_told_otherwise(always: boo
     learner = _learner(_Measured, always=always)
     for seed in range(2):
         _pilot(learner, seed)
-        decision = learner.learn(None, is_last=False)
+        decision = learner.learn(Pilot(None, False))
     assert (learner.guide is not None) == always
-    assert (type(decision) is DirectionSamples) == (not always)
+    assert (decision is None) == (not always)
     assert learner.guidance.gain == 0 and str(learner).startswith("no guide: ") == (not always)
 
 
@@ -143,14 +143,14 @@ def test_beside_light_paths_it_learns_from_new_samples_only() -> None:
     learner = _learner(always=True)
     for seed in (1, 2):
         _pilot(learner, seed)
-        learner.learn(None, is_last=False)
+        learner.learn(Pilot(None, False))
     guide, guidance, count = learner.guide, learner.guidance, learner.sample_count
     # Where a sample takes longer, guides cost less in comparison
     later, slow = learner.beside_light_paths(1.0), learner.beside_light_paths(100.0)
     for other in (later, slow):
         assert other.guide is guide
         _pilot(other, 3)
-        assert other.learn(None, is_last=True) is other.guide is not guide
+        assert other.learn(Pilot(None, True)) is other.guide is not guide
         assert other.sample_count == count / 2
     assert slow.guidance.efficiency > later.guidance.efficiency
     assert (learner.guide, learner.guidance, learner.sample_count) == (guide, guidance, count)
@@ -161,7 +161,7 @@ def test_gains_that_are_not_numbers_are_none() -> None:
     learner = _learner()
     for seed in (1, 2):
         _pilot(learner, seed, brought=lambda pixel, u: _at(u, 1e30))
-        learner.learn(None, is_last=False)
+        learner.learn(Pilot(None, False))
     assert learner.guide is None and str(learner).startswith("no guide: ")
 
 
@@ -175,7 +175,7 @@ def test_a_pilot_in_which_no_path_scatters_teaches_nothing(pilot: int) -> None:
     learner = _learner()
     for index in range(3):
         _pilot(learner, index, scatters=index != pilot)
-        learner.learn(None, is_last=index == 2)
+        learner.learn(Pilot(None, index == 2))
     assert learner.guide is not None
 
 
@@ -184,14 +184,14 @@ def test_stride_follows_from_the_memory() -> None:
         stride = -(-6 * LANES // records)
         learner = _learner(max_memory=records * BYTES_PER_RECORD)
         _pilot(learner, 1)
-        learner.learn(None, is_last=False)
+        learner.learn(Pilot(None, False))
         assert learner.sample_count == 2 * -(-LANES // stride)
 
 
 def test_later_directions_are_not_guided() -> None:
     learner = _learner()
     _pilot(learner, 1)
-    learner.learn(None, is_last=True)
+    learner.learn(Pilot(None, True))
     guide = GuidedDirections(learner.guide.trees, learner.guide.regions, bounces=1)
     state, active = guide.begin(None, None, _pixels()), dr.full(mi.Bool, True, LANES)
     state = guide.draw(state, _Numbers(2), vertex_at(0), active)[3]

@@ -6,17 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_ext.techniques.shadow_rejection.light_map_roulette_learner import (
-    LightMapRouletteLearner,
-)
 
-from mitsuba_ext.planning.evidence import SEGMENT, SHADOW, TABLE
+from mitsuba_ext.planning.costs import SEGMENT, SHADOW, TABLE
+from mitsuba_ext.planning.learner import Pilot
 from mitsuba_ext.scene.lights import weights as lights_weights
 from mitsuba_ext.scene.lights.choice import Choice
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
 from mitsuba_ext.transport.light_table import LightTable, OneRow
-from mitsuba_ext.transport.path_decisions import EmitterSampling
+from mitsuba_ext.transport.rejection_law import RejectionLaw
 from tests.support.lights import ball
 from tests.support.maps import (
     connect,
@@ -192,10 +190,10 @@ def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(
     scene = floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50))  # nothing to choose between
     learner = learner_of(scene, **wishes)
     if rejects:
-        LightMapRouletteLearner(learner, law="affine", slope=10.0, floor=0.1)
+        learner.shadow_test(RejectionLaw("affine", 10.0, 0.1))
     _pilot(learner, as_path=1.0)
-    decision = learner.learn(scene, is_last=False)
-    assert (type(decision) is EmitterSampling) == ends
+    decision = learner.learn(Pilot(scene, False))
+    assert (decision is None) == ends
     assert ("as path" in str(learner)) == ends and (learner.map is None) == ends
 
 
@@ -215,7 +213,7 @@ def test_learning_goes_on_where_lights_were_chosen_better_than_by_path():
     learner = learner_of(scene)
     learner._is_tested = True  # the first pilot is over
     _pilot(learner, as_path=0.05)
-    assert type(learner.learn(scene, is_last=False)) is LightTable
+    assert type(learner.learn(Pilot(scene, False))) is LightTable
     assert "less variance" in str(learner._effect)
 
 

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_ext.techniques.shadow_rejection.light_map_roulette import LightMapRoulette
 
 from mitsuba_ext.planning.scout import Scout
 from mitsuba_ext.scene.lights.choice import Choice
@@ -18,8 +17,10 @@ from mitsuba_ext.scene.lights.shutter_times import ShutterTimes
 from mitsuba_ext.scene.regions.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.scene.regions.surface_sides import region
 from mitsuba_ext.techniques.learned_lights.light_map import LightMap
+from mitsuba_ext.techniques.learned_lights.shadow_roulette import LightMapRoulette
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.light_table import LightTable
+from mitsuba_ext.transport.rejection_law import RejectionLaw
 from tests.support.maps import (
     connect,
     floor,
@@ -202,7 +203,7 @@ def test_the_roulette_reads_the_chosen_cell():
     si = surface((0.1, 0.1, 0))
     row = light_map.rows.row(si, mi.Bool(True))
     for law, blocked in (("affine", 0.01), ("paper", 1e-4)):
-        roulette = LightMapRoulette(light_map, slope=10, floor=0.005, law=law)
+        roulette = LightMapRoulette(light_map, RejectionLaw(law, 10, 0.005))
         choices = [Choice(row, mi.UInt32(cell), None) for cell in (0, 1)]
         p = [float(roulette.probability((), c, si, None, True)[0][0]) for c in choices]
         assert p[1] == 1 and p[0] == pytest.approx(blocked, abs=0.02)

@@ -18,6 +18,7 @@ from mitsuba_ext.techniques.shadow_rejection.visibility_roulette_learner import 
     VisibilityRouletteLearner,
 )
 from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.rejection_law import RejectionLaw
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -130,11 +131,11 @@ def test_what_was_counted_becomes_the_table_and_the_roulette():
     si.p = p
     for q, expected in ((across, 10 * 0.5 / 91 + 0.01), (within, 1.0), (_points([9, 9, 9]), 1.0)):
         ds.p = q
-        roulette = VisibilityRoulette(visibility, slope=10, floor=0.01, law="affine")
+        roulette = VisibilityRoulette(visibility, RejectionLaw("affine", 10, 0.01))
         p_test = roulette.probability((), (), si, ds, mi.Bool(True))[0]
         assert float(p_test[0]) == pytest.approx(expected)
     ds.p = across
-    paper = VisibilityRoulette(visibility, slope=10, floor=0.01, law="paper")
+    paper = VisibilityRoulette(visibility, RejectionLaw("paper", 10, 0.01))
     assert float(paper.probability((), (), si, ds, mi.Bool(True))[0][0]) == pytest.approx(1e-4)
 
 
@@ -169,7 +170,7 @@ def test_the_same_seed_gives_bitwise_the_same_map(scenes):
     walk_maps = []
     for _ in range(2):
         integrator = mi.load_dict({"type": "neepp", "max_depth": 4})
-        learner = VisibilityRouletteLearner(12, 16, 4, law="affine", slope=10, floor=0.1)
+        learner = VisibilityRouletteLearner(12, 16, 4, RejectionLaw("affine", 10, 0.1))
         learner.start(scene, mi.Point3f(), mi.Normal3f())
         walk, visibility = integrator.walk(observer=learner), learner._map
         sampler = mi.load_dict({"type": "independent"})

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.planning import pilots
 from mitsuba_ext.techniques.swarming import map_learner
-from mitsuba_ext.techniques.swarming import parameters as swarm_parameters
 from mitsuba_ext.techniques.swarming.bounce_records import BounceRecords
 from mitsuba_ext.techniques.swarming.mapped_lights import light_cells
 from mitsuba_ext.techniques.swarming.mapped_lobes import path_density
@@ -152,7 +152,7 @@ _CROPPED = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_heigh
 
 
 def test_each_pixel_has_its_sample_where_the_first_one_is_divided(monkeypatch) -> None:
-    monkeypatch.setattr(swarm_parameters, "_LEAST_PIXELS", 1)
+    monkeypatch.setattr(pilots, "_LEAST_PIXELS", 1)
     scene = mi.load_dict({
         "type": "scene", "sky": {"type": "constant", "radiance": 0.5},
         "sensor": {**sensor(), "film": {**film(13, 11), **_CROPPED}},
@@ -166,7 +166,7 @@ def test_each_pixel_has_its_sample_where_the_first_one_is_divided(monkeypatch) -
 
 @pytest.mark.slow
 def test_mean_where_the_first_sample_is_divided(monkeypatch) -> None:
-    monkeypatch.setattr(swarm_parameters, "_LEAST_PIXELS", 1)
+    monkeypatch.setattr(pilots, "_LEAST_PIXELS", 1)
     scene = _streaks(13, 11)
     plain = mi.load_dict({"type": "composed_path", "max_depth": 4})
     expected = batches(scene, plain, 512, [1001, 1002])

@@ -84,7 +84,9 @@ def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
         inner = nest(("lens", "time"), timeout=3.0)
         outer = mi.load_dict({"type": "reweighted_wavelength", "timeout": timeout, "nested": inner})
         scene = white()
-        stage = outer.schedule(scene, scene.sensors()[0], (4096,), 1).next_stage()
+        sensor = scene.sensors()[0]
+        plan = outer.plan_learning(scene, sensor, 4096)
+        stage = outer.schedule(scene, sensor, (4096,), 1, plan).next_stage()
         return {numbers._sets.count for numbers in vars(stage.camera).values() if numbers}
 
     assert points_of_sets(9.0) == {64} and points_of_sets(-1.0) == {1024}
@@ -94,7 +96,9 @@ def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
 def test_purposes_pixels_and_sets_draw_numbers_of_their_own(variant):
     nested = nest(("lens", "time", "wavelength"), pattern="sobol")
     scene = white()
-    schedule = mi.load_dict(nested).schedule(scene, scene.sensors()[0], (16,), 1)
+    integrator, sensor = mi.load_dict(nested), scene.sensors()[0]
+    plan = integrator.plan_learning(scene, sensor, 16)
+    schedule = integrator.schedule(scene, sensor, (16,), 1, plan)
     stage = schedule.next_stage()
     pixel = dr.arange(mi.UInt32, 1 << 15)
     sets = [numbers for numbers in vars(stage.camera).values() if numbers]

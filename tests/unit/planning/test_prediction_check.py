@@ -8,7 +8,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_ext.bases.light_path_schedule import LightPathSchedule
 
 from mitsuba_ext.estimators.light_paths.choice import light_paths
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
@@ -16,11 +15,16 @@ from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathChoic
 from mitsuba_ext.estimators.light_paths.choice.predicted_errors import PredictedErrors
 from mitsuba_ext.estimators.light_paths.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.images.coarse_film import CoarseFilm
+from mitsuba_ext.planning.planner import LearningPlan, Planner
 from mitsuba_ext.planning.prediction_check import PredictionCheck
+from mitsuba_ext.planning.technique import ParameterReader, Setting
+from mitsuba_ext.planning.trial import Rival
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
 from mitsuba_ext.rendering.stages import Stage
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
+from mitsuba_ext.techniques.guided_directions.parameters import Guided
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
+from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.walk import Walk
 from tests.support.statistical import load
 
@@ -68,17 +72,17 @@ def test_passes_show_mean_and_variance(rfilter: str, pixel_format: str) -> None:
 
 
 @pytest.mark.parametrize("efficiency", [0.8, 1.02, 1.25])
-def test_a_broken_promise_is_seen(efficiency: float) -> None:
+def test_a_choice_that_is_worse_than_predicted_is_seen(efficiency: float) -> None:
     film = film_of("gaussian", sample_border=True)
     border = 2 * film.rfilter().border_size()
     coarse = CoarseFilm.of(_SIZE + border, _SIZE + border, 512)
     of_path = np.full(coarse.width * coarse.height, 1 / 12 + 0.5 * 2**2)
-    promise = PredictionCheck(film, coarse, of_path)
-    assert not promise.failed(time=9.0, rival=9.0)
-    fill(promise.images, film, FEWEST_PASSES)
+    check = PredictionCheck(film, coarse, of_path)
+    assert not check.failed(time=9.0, rival=9.0)
+    fill(check.images, film, FEWEST_PASSES)
     # The variance is that of ``path``
-    failed = promise.failed(time=2 / efficiency, rival=0.5)
-    assert promise.variance == pytest.approx(1, rel=0.05)
+    failed = check.failed(time=2 / efficiency, rival=0.5)
+    assert check.variance == pytest.approx(1, rel=0.05)
     assert failed == (efficiency < 0.9)
 
 
@@ -91,15 +95,15 @@ def test_a_given_weight_lets_rare_bright_samples_count() -> None:
     bright[[500, 1500]] = 1000, 2000
     variances = {}
     for weight in (None, np.ones(_SIZE * _SIZE)):
-        promise = PredictionCheck(film, coarse, np.ones(_SIZE * _SIZE), weight=weight)
+        check = PredictionCheck(film, coarse, np.ones(_SIZE * _SIZE), weight=weight)
         block = film.create_block()
-        promise.images.begin(block, None, 0)
+        check.images.begin(block, None, 0)
         for number in range(FEWEST_PASSES):
             value = mi.Float(bright if number == 0 else np.ones(_SIZE * _SIZE))
             block.put(mi.Point2f(x, y), [value, value, value, mi.Float(1)])
-            promise.images.add(block, None, number + 1)
-        promise.failed(1.0, 1.0)
-        variances[weight is None] = promise.variance
+            check.images.add(block, None, number + 1)
+        check.failed(1.0, 1.0)
+        variances[weight is None] = check.variance
     expected = 999**2 / 3 / (_SIZE**2 - 1)
     assert variances[False] == pytest.approx(expected, rel=0.01)
     assert variances[True] < 0.1 * expected
@@ -117,11 +121,11 @@ def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
 @pytest.mark.parametrize(("merges", "expected"), [(False, 4.0), (True, 8.0)])
 def test_guides_help_light_paths_too_but_not_merging(merges: bool, expected: float) -> None:
     trial = LightPathTrial(film_of("box"), _SPP)
-    trial.rival, trial.guide_efficiency, trial.costs, trial._best = 8.0, 4.0, [1.0, 2.0], 1
+    trial.costs, trial._best = [1.0, 2.0], 1
     trial._choice = LightPathChoice(Candidate(0.25, merges=merges))
     seen = []
     trial.check = SimpleNamespace(failed=lambda *arguments: seen.append(arguments))
-    assert trial.reconsider(time=1.0, margin=1.1) is None
+    assert trial.reconsider(Rival(8.0, guides=4.0), time=1.0, margin=1.1) is None
     assert seen == [(2.0, expected)]
 
 
@@ -140,50 +144,55 @@ def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
         samples=1 << 20, candidates=[Candidate(0.0), Candidate(1.0, merges=merges)], counts=None,
         estimate=lambda: None,
     )  # fmt: skip
-    trial.rival = trial.guide_efficiency = 3.0
-    choice = trial.learn(None, is_last=True)
-    assert choice.techniques.light_paths == (0 if merges else 1)
+    choice = trial.choose(Rival(3.0, guides=3.0))
+    assert (choice is None) == merges
 
 
 def test_going_back_brings_back_the_guide_as_it_is() -> None:
     """Not as it would be with the samples of all pilots, nor with the margin of the choice."""
     guide = GuideLearner.__new__(GuideLearner)
     guide.guide, guide.guidance = True, SimpleNamespace(efficiency=2.0)
+    guide.finish = lambda: None
     rivals = []
 
-    def learn(scene: Any, is_last: bool) -> LightPathChoice:
-        rivals.append(trial.rival)
+    def choose(rival: Rival) -> LightPathChoice:
+        rivals.append(rival.efficiency)
         return LightPathChoice(Candidate(1.0, merges=True))
 
     trial = SimpleNamespace(
-        learn=learn, leaves_out=(), promise=None, can_be_guided=False, chosen_variance=0.1
-    )
-    inner = SimpleNamespace(
-        learners={"directions": guide}, beside={}, decisions={}, is_at_end=False,
-        leave_out=lambda slots: None, stage_again=lambda: Stage(None),
+        choose=choose, leaves_out=lambda slot, finds_all_light: finds_all_light, check=None,
+        can_be_guided=False, chosen_variance=0.1, path_variance=None,
+        reconsider=lambda rival, time, margin: rivals.append(rival.efficiency), effect=None,
+        __str__=lambda: "",
     )  # fmt: skip
-    schedule = LightPathSchedule(inner, None, 2, trial, 1 << 30)
-    schedule._next = Stage(None)
-    assert schedule.next_stage().forgets
-    assert rivals[0] > 2.5 and trial.rival == pytest.approx(2.0)
+    scene = load("caustic", width=96, height=54)
+    setting = Setting(scene, scene.sensors()[0], 0, 6, 5, 1 << 18)
+    techniques = {"directions": Guided(ParameterReader.of_defaults("auto"))}
+    plan = LearningPlan((1, 1, 1), trial=lambda spp: trial, tries=True)
+    planner = Planner(
+        techniques, setting, (1, 1, 1, 1), lambda *_: None, Decisions(), plan
+    )
+    planner.learners["directions"], planner._next = guide, Stage(None)
+    assert planner.next_stage().discards_earlier
+    assert rivals[0] > 2.5 and rivals[1] == pytest.approx(2.0)
 
 
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
 
-    def failed(promise: PredictionCheck, time: float, rival: float) -> bool:
-        counts.append(promise.images.count)
-        promise.variance = 5.0
+    def failed(check: PredictionCheck, time: float, rival: float) -> bool:
+        counts.append(check.images.count)
+        check.variance = 5.0
         return True
 
-    stages, next_stage = [], LightPathSchedule.next_stage
+    stages, next_stage = [], Planner.next_stage
 
-    def remembered(schedule: LightPathSchedule) -> Any:
+    def remembered(schedule: Planner) -> Any:
         stages.append(next_stage(schedule))
         return stages[-1]
 
     monkeypatch.setattr(PredictionCheck, "failed", failed)
-    monkeypatch.setattr(LightPathSchedule, "next_stage", remembered)
+    monkeypatch.setattr(Planner, "next_stage", remembered)
     integrator = mi.load_dict({"type": "auto", "max_depth": 6})
     scene = load("caustic", width=96, height=54)
     image = np.array(integrator.render(scene, spp=64, seed=1))

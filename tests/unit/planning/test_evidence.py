@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning.evidence import BATCHES, TRIM, gain_of, is_worth, trimmed_batches
+from mitsuba_ext.planning.evidence import BATCHES, TRIM, gain_of, trimmed_batches
+from mitsuba_ext.planning.verdicts import is_worth
 
 
 def _paths(seed: int, count: int = 1 << 14) -> tuple[np.ndarray, np.ndarray]:
