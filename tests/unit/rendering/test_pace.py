@@ -51,13 +51,13 @@ class _Clock:
 def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
     clock, asked = _Clock(monkeypatch), []
     integrator = _integrator("auto_path", timeout=10.0)
-    pilots = integrator.pilots
+    plan = integrator.plan_learning
 
     def remembered(scene, sensor, spp, *kernels):
         asked.append(spp)
-        return pilots(scene, sensor, spp, *kernels)
+        return plan(scene, sensor, spp, *kernels)
 
-    integrator.pilots = remembered
+    integrator.plan_learning = remembered
     integrator.render(_scene(), spp=5000)
     assert asked == [5000, 99]
     assert clock.now == pytest.approx(10, rel=0.05)
