@@ -10,7 +10,7 @@ from dataclasses import replace
 import mitsuba as mi
 
 from mitsuba_ext.bases.bidirectional_integrator import LightPathIntegrator
-from mitsuba_ext.bases.learned_slots import learned_slots
+from mitsuba_ext.bases.slots import auto_techniques
 from mitsuba_ext.bases.staged_integrator import NO_LIMIT
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
 from mitsuba_ext.estimators.light_paths.choice.light_paths import (
@@ -148,7 +148,7 @@ class Auto(LightPathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
-        self.fill(props, **learned_slots(self.name))
+        self.fill(props, **auto_techniques(self.name))
 
     @property
     def needs_equal_samples(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.bases.learned_slots import learned_slots
+from mitsuba_ext.bases.slots import auto_techniques
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 
@@ -82,4 +82,4 @@ class AutoPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.fill(props, **learned_slots(self.name))
+        self.fill(props, **auto_techniques(self.name))

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.bases.slots import METHODS
+from mitsuba_ext.bases.slots import LIGHT_CHOICES
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.learned_lights.parameters import LearnedLights
 from mitsuba_ext.techniques.shadow_rejection.parameters import RejectedShadowRays
 
 _LEARNING = "lights that are chosen by what was learned (visibility or contribution)"
@@ -133,11 +132,11 @@ class NEEPlusPlus(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         read = self.reader(props)
-        method = read("light_sampling", "contribution", choices=tuple(METHODS))
+        method = read("light_sampling", "contribution", choices=tuple(LIGHT_CHOICES))
         rejects = read("rejection", False)
-        make_lights = METHODS[method]
+        make_lights = LIGHT_CHOICES[method]
         lights = make_lights(read) if make_lights else None
-        learns = isinstance(lights, LearnedLights)
+        learns = lights is not None and lights.tells_visibility
         rejection = RejectedShadowRays(read, has_own_map=not learns) if rejects else None
         self.fill(props, next_event=lights, shadow_test=rejection)
         read.refuse_without_effect(_CONDITIONS)

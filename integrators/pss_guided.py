@@ -9,8 +9,7 @@ from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
-from mitsuba_ext.techniques.guided_directions.parameters import Guided
-from mitsuba_ext.techniques.guided_directions.roulette_parameters import GuidedRoulette
+from mitsuba_ext.techniques.guided_directions.parameters import Guided, GuidedRoulette
 from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 

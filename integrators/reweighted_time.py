@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from mitsuba_ext.bases.reweighted_camera import ReweightedCamera
 from mitsuba_ext.startup import registry
+
+from ._reweighted_camera import ReweightedCamera
 
 
 @registry.plugin

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.bases.reweighted_camera import ReweightedCamera
 from mitsuba_ext.startup import registry
+
+from ._reweighted_camera import ReweightedCamera
 
 
 @registry.plugin

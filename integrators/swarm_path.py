@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.swarming.parameters import MAPS
+from mitsuba_ext.techniques.swarming.parameters import TECHNIQUES
 
 #: For each parameter, the slot that its maps fill.
 _SLOTS = {
@@ -14,6 +14,9 @@ _SLOTS = {
     "distance_map": "distance", "light_map": "light_numbers", "lobe_map": "directions",
     "direction_map": "scattering",
 }  # fmt: skip
+
+#: The maps of each slot.
+_MAPS = {slot: maps for maps in TECHNIQUES for slot in maps.slots}
 
 #: Maps that are off by default, because they rarely gain more than they cost.
 _OFF_BY_DEFAULT = ("direction_map",)
@@ -156,7 +159,7 @@ class SwarmPath(WalkIntegrator):
         self.fill(
             props,
             **{
-                slot: MAPS[slot](self.reader(props), always)
+                slot: _MAPS[slot](self.reader(props), always)
                 for key, slot in _SLOTS.items()
                 if is_wanted[key]
             },

@@ -52,7 +52,9 @@ def kinds() -> dict[str, list[Path]]:
     found["samplers"] = [file for file in samplers if file.stem not in decisions]
     found["bases"] = [
         file
-        for file in sorted((ROOT / "mitsuba_ext" / "bases").glob("*.py"))
+        for file in sorted([
+            *(ROOT / "mitsuba_ext" / "bases").glob("*.py"), *(ROOT / "integrators").glob("_*.py")
+        ])
         if _LIST in file.read_text(encoding="utf-8")
     ]
     return found

@@ -91,6 +91,10 @@ class ParameterReader:
         """A reader without parameters of the scene: it returns the defaults."""
         return cls(plugin, mi.Properties(plugin), names, **defaults)
 
+    def default(self, key: str, default: Any) -> Any:
+        """The plugin's default of a parameter that the scene cannot give here."""
+        return self._defaults.get(key, default)
+
     def is_given(self, key: str) -> bool:
         """Whether the scene gives this parameter."""
         return self._names.get(key, key) in self._props
@@ -120,8 +124,14 @@ class Technique:
     renders: it holds no state of any of them.
 
     Attributes:
-        name: Its name in scenes: a plugin, or a word.
+        name: Its name in scenes.
         slots: The slots of an integrator that it can fill.
+        words: The words by which a scene chooses it, and the further arguments of its constructor
+            for each.
+        values: What else than a word it is chosen by, for error messages
+            (:meth:`of_value`).
+        is_default: Whether it is the default of its slots.
+        is_plugin: Whether a plugin of its name can be nested in its slots.
         pilot_spp: Pilot samples per pixel from which it learns, by default; 0 if it does not learn.
         pilot_paths: How many samples of the whole film are enough to learn from; 0 if more are
             always better.
@@ -145,6 +155,9 @@ class Technique:
 
     name = ""
     slots: tuple[str, ...] = ()
+    words: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+    values = ""
+    is_default = is_plugin = False
     pilot_spp = 0
     pilot_paths = 0
     doubles = False
@@ -156,6 +169,14 @@ class Technique:
     tells_visibility = False
     sample_cost = 1
     needs_equal_samples = ""
+
+    def __init__(self, read: ParameterReader | None = None) -> None:
+        """Reads the parameters; by default, there are none."""
+
+    @classmethod
+    def of_value(cls, plugin: str, slot: str, value: Any) -> Technique | None:
+        """The technique for a number or the like; ``None`` if it does not take this value."""
+        return None
 
     def check_slot(self, plugin: str, slot: str) -> None:
         """

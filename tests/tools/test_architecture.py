@@ -170,3 +170,69 @@ def test_tests_import_from_the_support_folder_only() -> None:
                 and not f"{module}.".startswith("tests.support.")
             ]
     assert not found, "\n".join(found)
+
+
+#: What imports from the folder of a technique: the table of slots, plugins, and nobody else.
+_TABLE = ("bases", "slots")
+
+
+def _techniques() -> list[str]:
+    return [path.parent.name for path in sorted((PACKAGE / "techniques").glob("*/__init__.py"))]
+
+
+@pytest.mark.parametrize("technique", _techniques())
+def test_a_technique_is_imported_by_the_table_and_its_plugins_only(technique: str) -> None:
+    imported = ("techniques", technique)
+    found = [
+        file.relative_to(ROOT)
+        for file, package in _files(PACKAGE)
+        if file.relative_to(PACKAGE).parts[:2] != imported
+        and file.relative_to(PACKAGE).with_suffix("").parts != _TABLE
+        for module in _imports(file, package)
+        if module[:2] == imported
+    ]
+    assert not found
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+def test_nobody_asks_for_the_class_of_a_technique() -> None:
+    """Neither a technique nor its learner, outside of its own folder."""
+    homes: dict[str, Path] = {}
+    for file, _package in _files(PACKAGE / "techniques"):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                homes[node.name] = file.parent
+    found = []
+    for folder in (PACKAGE, *(ROOT / plugins for plugins in PLUGINS)):
+        for file in sorted(folder.rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+                    kinds = _names(node.args[1]) & set(homes)
+                    if any(homes[kind] not in file.parents for kind in kinds):
+                        found.append(f"{file.relative_to(ROOT)}:{node.lineno}")
+    assert len(homes) > 50 and not found
+
+
+def test_thresholds_of_efficiency_and_costs_are_those_of_the_planner() -> None:
+    """What is compared with a gain, an efficiency or a cost has its name from ``planning``."""
+    measures = ("gain", "efficiency", "cost", "worth")
+    found = []
+    for file, _package in _files(PACKAGE):
+        if "planning" in file.relative_to(PACKAGE).parts:
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        own = {
+            target.id
+            for node in tree.body if isinstance(node, ast.Assign)
+            for target in ast.walk(node.targets[0])
+            if isinstance(target, ast.Name) and target.id.strip("_").isupper()
+        }  # fmt: skip
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Compare) and _names(node) & own:
+                words = ast.unparse(node).lower()
+                if any(measure in words for measure in measures):
+                    found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}")
+    assert not found, "\n".join(found)

@@ -1,4 +1,4 @@
-"""The slot ``directions``: which primary samples choose the directions of a path."""
+"""The parameters of path guiding: of the directions of a path, and of its roulette."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
+from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
 from .surface_regions import SurfaceRegions
 from .tile_regions import MOST_BOUNCES, TileRegions
@@ -26,7 +27,8 @@ class Guided(Technique):
     """
 
     name = "guided_directions"
-    slots = ("directions",)
+    slots, is_plugin = ("directions",), True
+    words = {"guided": {}}
     pilot_spp, tries, finds_all_light = 32, True, True
 
     def __init__(self, read: ParameterReader) -> None:
@@ -67,3 +69,24 @@ class Guided(Technique):
             (width, height),
             self.always_guide,
         )
+
+
+class GuidedRoulette(Technique):
+    """Russian roulette by the radiance that a path is expected to add to its pixel, where
+    directions are guided by regions of surfaces; elsewhere the roulette of Mitsuba's ``path``."""
+
+    name, is_default = "automatic", True
+    words = {"automatic": {}}
+    slots, finds_all_light = ("roulette",), True
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        guide = others.get("directions")
+        # A guide by tiles of the film learns nothing about the position of a bounce
+        if not isinstance(guide, GuideLearner) or not guide.wants_scout:
+            return None
+        if setting.rr_depth >= setting.max_depth:
+            return None
+        return RouletteLearner(guide, setting.rr_depth)
+
+
+TECHNIQUES = Guided, GuidedRoulette

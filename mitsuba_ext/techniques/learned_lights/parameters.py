@@ -28,8 +28,9 @@ class LearnedLights(Technique):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    name = "learned_lights"
+    name, is_plugin = "learned_lights", True
     slots = ("next_event",)
+    words = {target: {"target": target} for target in reversed(TARGETS)}
     pilot_spp, tries, tells_visibility = 16, True, True
 
     def __init__(self, read: ParameterReader, target: str = "") -> None:
@@ -75,3 +76,6 @@ class LearnedLights(Technique):
 
     def parameters(self, *slots: Slots) -> dict[str, Any]:
         return {**super().parameters(*slots), "grid": self.grid or "automatic"}
+
+
+TECHNIQUES = (LearnedLights,)

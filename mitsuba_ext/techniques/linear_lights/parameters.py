@@ -12,8 +12,11 @@ class LinearLights(Technique):
     """Chooses lights by an estimate of what each contributes to the vertex."""
 
     name = "linear"
-    slots = ("next_event",)
+    slots, words = ("next_event",), {"linear": {}}
     sees_media = False
 
     def decision(self, setting: Setting) -> Any | None:
         return LinearChoice(setting.scene) if len(setting.scene.emitters()) > 1 else None
+
+
+TECHNIQUES = (LinearLights,)

@@ -35,20 +35,16 @@ class MisHeuristic(Technique):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    name = "mis_heuristic"
+    name, is_plugin = "mis_heuristic", True
     slots = ("mis",)
+    words = {heuristic: {"heuristic": heuristic} for heuristic in HEURISTICS[1:]}
 
-    def __init__(self, read: ParameterReader) -> None:
-        self.heuristic = read("heuristic", HEURISTICS[0], choices=HEURISTICS)
+    def __init__(self, read: ParameterReader, heuristic: str = "") -> None:
+        self.heuristic = heuristic or read("heuristic", HEURISTICS[0], choices=HEURISTICS)
         if self.heuristic == "power":
             self.exponent = read("exponent", 2.0, minimum=1.0, maximum=64.0)
         if self.heuristic == "cutoff":
             self.threshold = read("threshold", 0.1, minimum=0.0, maximum=1.0)
-
-    @classmethod
-    def named(cls, heuristic: str) -> Callable[[ParameterReader], MisHeuristic]:
-        """Returns a function that makes one with the default parameters of a heuristic."""
-        return lambda read: cls(ParameterReader.of_defaults(read.plugin, heuristic=heuristic))
 
     def decision(self, setting: Setting) -> Any | None:
         return _MAKERS[self.heuristic](self)
@@ -56,3 +52,6 @@ class MisHeuristic(Technique):
     def describe(self, slots: Slots = MappingProxyType({})) -> str:
         is_plain = list(self.parameters(slots)) == ["heuristic"]
         return self.heuristic if is_plain else super().describe(slots)
+
+
+TECHNIQUES = (MisHeuristic,)

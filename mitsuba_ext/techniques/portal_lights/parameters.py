@@ -13,8 +13,8 @@ class PortalLights(Technique):
     """Samples directions of the environment through portals. The attributes are the parameters of
     the plugin ``portal_lights``; see there."""
 
-    name = "portal_lights"
-    slots = ("next_event",)
+    name, is_plugin = "portal_lights", True
+    slots, words = ("next_event",), {"portals": {}}
     camera_paths_only = True
 
     def __init__(self, read: ParameterReader) -> None:
@@ -25,3 +25,6 @@ class PortalLights(Technique):
         if scene.environment() is None or not portals(scene) or self.share == 0:
             return None
         return PortalSampling(scene, self.share)
+
+
+TECHNIQUES = (PortalLights,)

@@ -15,8 +15,8 @@ class ResampledLightsChoice(Technique):
     """Chooses one of several candidate lights by what each would contribute. The attributes are the
     parameters of the plugin ``resampled_lights``; see there."""
 
-    name = "resampled_lights"
-    slots = ("next_event",)
+    name, is_plugin = "resampled_lights", True
+    slots, words = ("next_event",), {"resampled": {}}
     camera_paths_only = True
     sees_media = False
 
@@ -31,3 +31,6 @@ class ResampledLightsChoice(Technique):
         if not setting.scene.emitters():
             return None
         return ResampledLights(setting.scene, self.candidates)
+
+
+TECHNIQUES = (ResampledLightsChoice,)

@@ -36,8 +36,8 @@ class RejectedShadowRays(Technique):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    name = "visibility_roulette"
-    slots = ("shadow_test",)
+    name, is_plugin = "visibility_roulette", True
+    slots, words = ("shadow_test",), {"visibility_roulette": {}}
     pilot_spp = 16
 
     def __init__(self, read: ParameterReader, has_own_map: bool = True) -> None:
@@ -78,3 +78,6 @@ class RejectedShadowRays(Technique):
 
     def _uses_own_map(self, slots: Slots) -> bool:
         return not getattr(slots.get("next_event"), "tells_visibility", False)
+
+
+TECHNIQUES = (RejectedShadowRays,)

@@ -22,7 +22,7 @@ class PowerLights(Technique):
     """Chooses lights by their power."""
 
     name = "power"
-    slots = ("next_event",)
+    slots, words = ("next_event",), {"power": {}}
 
     def decision(self, setting: Setting) -> Any | None:
         if len(setting.scene.emitters()) < 2:
@@ -35,8 +35,8 @@ class SpatialLights(Technique):
     """Chooses lights by their unoccluded contribution to a voxel. The attributes are the parameters
     of the plugin ``spatial_lights``; see there."""
 
-    name = "spatial_lights"
-    slots = ("next_event",)
+    name, is_plugin = "spatial_lights", True
+    slots, words = ("next_event",), {"spatial": {}}
 
     def __init__(self, read: ParameterReader) -> None:
         self.grid = read.optional_count("grid", 1024)
@@ -67,3 +67,6 @@ class SpatialLights(Technique):
 
     def parameters(self, *slots: Slots) -> dict[str, Any]:
         return {**super().parameters(*slots), "grid": self.grid or "automatic"}
+
+
+TECHNIQUES = PowerLights, SpatialLights

@@ -33,20 +33,20 @@ class Swarm(Technique):
 
     Parameters:
         always: Use the maps also where pilots show that they do not pay off? For tests.
-        pilot_spp: Samples per pixel of the pilots.
 
     Attributes:
         summary: The name of the maps in the log.
     """
 
     name = "swarm"
+    words = {"swarm": {}}
     doubles = True
     # The learners of all maps together record about 150 bytes for each sample
     most_lanes = 1 << 21
     summary = ""
 
-    def __init__(self, read: ParameterReader, always: bool = False, pilot_spp: int = 64) -> None:
-        self._always, self._pilot_spp = always, pilot_spp
+    def __init__(self, read: ParameterReader, always: bool = False) -> None:
+        self._always, self._pilot_spp = always, read.default("pilot_spp", 64)
 
     @property
     def pilot_spp(self) -> int:
@@ -189,8 +189,6 @@ class DistanceMaps(Swarm):
         return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
-#: The maps that each slot can hold.
-MAPS: dict[str, type[Swarm]] = {
-    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
-    "light_numbers": LightMapsChoice, "directions": LobeMaps, "scattering": DirectionMaps,
-}  # fmt: skip
+TECHNIQUES = (
+    LensMaps, TimeMaps, WavelengthMaps, DistanceMaps, LightMapsChoice, LobeMaps, DirectionMaps,
+)  # fmt: skip

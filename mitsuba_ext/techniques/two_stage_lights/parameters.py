@@ -24,8 +24,9 @@ class TwoStageLights(Technique):
     """Samples directions of the environment by the product of BSDF and light. The attributes are
     the parameters of the plugin ``two_stage_lights``; see there."""
 
-    name = "two_stage_lights"
+    name, is_plugin = "two_stage_lights", True
     slots = ("next_event",)
+    words = {"two_stage": {}, "triple_product": {"visibility": "primary"}}
     camera_paths_only = True
     sees_media = False
 
@@ -63,3 +64,6 @@ class TwoStageLights(Technique):
         if self.can_learn(setting.scene, setting.pilot_spp):
             return None  # the learner makes the decisions of all stages
         return TwoStage(setting.scene, self.splits, self.vertices == "all")
+
+
+TECHNIQUES = (TwoStageLights,)

@@ -48,11 +48,14 @@ class WeightedNumbers(Technique):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    name = "weighted_numbers"
+    name, is_plugin = "weighted_numbers", True
     slots = tuple(PURPOSES)
+    words = {pattern: {"pattern": pattern} for pattern in PATTERNS}
 
-    def __init__(self, read: ParameterReader, accepted: tuple[str, ...] = WEIGHTS) -> None:
-        self.pattern = read("pattern", "lattice", choices=PATTERNS)
+    def __init__(
+        self, read: ParameterReader, accepted: tuple[str, ...] = WEIGHTS, pattern: str = ""
+    ) -> None:
+        self.pattern = pattern or read("pattern", "lattice", choices=PATTERNS)
         self.weights = read("weights", "none", choices=accepted)
 
     def check_slot(self, plugin: str, slot: str) -> None:

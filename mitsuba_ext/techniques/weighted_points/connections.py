@@ -24,8 +24,8 @@ class Connections(Technique):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    name = "weighted_connections"
-    slots = ("connections",)
+    name, is_plugin = "weighted_connections", True
+    slots, values = ("connections",), "a number"
 
     def __init__(self, read: ParameterReader) -> None:
         self.pattern = read("pattern", "hammersley", choices=PATTERNS)
@@ -33,6 +33,12 @@ class Connections(Technique):
         most = MOST_SLOW_POINTS if self.pattern == SLOW_PATTERN else _MOST
         self.count = read("count", 16, minimum=0, maximum=most)
         self.vertices = read("vertices", "first", choices=("first", "all"))
+
+    @classmethod
+    def of_value(cls, plugin: str, slot: str, value: Any) -> Connections | None:
+        if type(value) is not int:
+            return None
+        return cls(ParameterReader.of_defaults(plugin, {"count": slot}, count=value))
 
     @property
     def sample_cost(self) -> int:

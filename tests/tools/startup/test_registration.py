@@ -115,8 +115,8 @@ for variant in {LLVM_VARIANTS!r} * 2:
     image = mi.render(scene, spp=4).numpy()
     assert (image > 0).all(), image
     nested = mi.load_dict({{"type": "reweighted_lens", "nested": {{"type": "pss_guided"}}}})
-    pilots = nested.pilots(scene, scene.sensors()[0], 256)
-    assert pilots, "it learns, whatever variants there were before"
+    plan = nested.plan_learning(scene, scene.sensors()[0], 256)
+    assert plan.pilots, "it learns, whatever variants there were before"
     kept[variant] = scene  # earlier variants' objects live on
 """)
 

@@ -68,17 +68,17 @@ class LightPathChoice:
 
 
 class LightPathCount(Technique):
-    """So many light paths for each camera path. The attribute is the parameter."""
+    """A number of light paths for each camera path. The attribute is the parameter."""
 
-    slots = ("light_paths",)
+    slots, values = ("light_paths",), f"a number from 0 to {MOST_PATHS:g}"
 
     def __init__(self, count: float) -> None:
         self.count = count
 
-    @staticmethod
-    def accepts(count: Any) -> bool:
-        """Can a scene ask for so many?"""
-        return type(count) in (int, float) and 0 <= count <= MOST_PATHS
+    @classmethod
+    def of_value(cls, plugin: str, slot: str, value: Any) -> LightPathCount | None:
+        is_number = type(value) in (int, float)
+        return cls(float(value)) if is_number and 0 <= value <= MOST_PATHS else None
 
     def decision(self, setting: Setting) -> LightPathChoice:
         return LightPathChoice(Candidate(self.count, merges=True))
@@ -109,7 +109,7 @@ class AutoLightPaths(Technique):
     """As many light paths, and those of their techniques, as a pilot finds to be worth the time."""
 
     name = "auto"
-    slots = ("light_paths",)
+    slots, words = ("light_paths",), {"auto": {}}
     pilot_spp, pilot_paths = 8, _ENOUGH
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
@@ -122,6 +122,9 @@ class AutoLightPaths(Technique):
         if not self.can_learn(setting.scene, setting.pilot_spp):
             return None
         return LightPathTrial(setting.sensor.film(), setting.spp)
+
+
+TECHNIQUES = AutoLightPaths, LightPathCount
 
 
 class LightPathTrial(Trial):

@@ -28,7 +28,7 @@ class LearnedSubpaths(Technique):
     """Chooses light vertices by how much those of their region contributed in the pilots."""
 
     name = "visibility"
-    slots = ("subpath_selection",)
+    slots, words = ("subpath_selection",), {"visibility": {}}
     pilot_spp, tries = 16, True
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
@@ -44,6 +44,9 @@ class LearnedSubpaths(Technique):
             setting.pilot_samples,
             film_extent(setting.sensor.film())[0],
         )
+
+
+TECHNIQUES = (LearnedSubpaths,)
 
 
 def _light_vertices(setting: Setting) -> LightVertexSample:

@@ -10,14 +10,18 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..planning.technique import ParameterReader, Setting
-from ..rendering.plan import Learning
-from ..rendering.stages import ChangedSchedule, Schedule, Stage
-from ..startup.registry import variant_bound
-from ..techniques.weighted_points.camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
-from ..techniques.weighted_points.pixel_sets import PixelSets
-from .staged_integrator import NO_LIMIT
-from .wrapping_integrator import WrappingIntegrator
+from mitsuba_ext.bases.staged_integrator import NO_LIMIT
+from mitsuba_ext.bases.wrapping_integrator import WrappingIntegrator
+from mitsuba_ext.planning.technique import ParameterReader, Setting
+from mitsuba_ext.rendering.plan import Learning
+from mitsuba_ext.rendering.stages import ChangedSchedule, Schedule, Stage
+from mitsuba_ext.startup.registry import variant_bound
+from mitsuba_ext.techniques.weighted_points.camera_numbers import (
+    PURPOSES,
+    WeightedNumbers,
+    samples_per_set,
+)
+from mitsuba_ext.techniques.weighted_points.pixel_sets import PixelSets
 
 
 @variant_bound
