@@ -4,6 +4,8 @@ transport → scene → util; ``pointsets`` needs nobody's scene, and no two roo
 from __future__ import annotations
 
 import ast
+import functools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,28 +37,36 @@ FLOORS = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 
-def _imports(file: Path, package: list[str]) -> Iterator[tuple[str, ...]]:
+@functools.cache
+def _tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _imports(file: Path, package: tuple[str, ...]) -> list[tuple[str, ...]]:
     """The modules that a file imports, anywhere in it, as paths from ``mitsuba_ext``.
 
     Parameters:
         package: The path of the package that holds the file, ``mitsuba_ext`` included.
     """
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    found: list[tuple[str, ...]] = []
+    for node in ast.walk(_tree(file)):
         if isinstance(node, ast.Import):
             modules = [alias.name.split(".") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
-            base = base + (node.module.split(".") if node.module else [])
+            base = [*base, *(node.module.split(".") if node.module else [])]
             # What is imported may itself be a module
             modules = [[*base, alias.name] for alias in node.names]
         else:
             continue
-        yield from (tuple(module[1:]) for module in modules if module[0] == "mitsuba_ext")
+        found += [tuple(module[1:]) for module in modules if module[0] == "mitsuba_ext"]
+    return found
 
 
-def _files(folder: Path) -> Iterator[tuple[Path, list[str]]]:
+def _files(folder: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
     for file in sorted(folder.rglob("*.py")):
-        yield file, ["mitsuba_ext", *file.relative_to(PACKAGE).parts[:-1]]
+        yield file, ("mitsuba_ext", *file.relative_to(PACKAGE).parts[:-1])
 
 
 @pytest.mark.parametrize("room", [room for room in FLOOR if room not in PLUGINS])
@@ -104,7 +114,7 @@ def test_bsdfs_are_called_in_one_place() -> None:
     found = []
     for folder in (PACKAGE, *(ROOT / plugins for plugins in PLUGINS)):
         for file in sorted(folder.rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for node in ast.walk(_tree(file)):
                 is_call = isinstance(node, ast.Attribute) and node.attr in calls
                 if is_call and "bsdf" in ast.unparse(node.value).lower():
                     found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}")
@@ -114,7 +124,7 @@ def test_bsdfs_are_called_in_one_place() -> None:
 
 def test_pointsets_need_neither_mitsuba_nor_drjit() -> None:
     for file, _package in _files(PACKAGE / "util" / "pointsets"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(_tree(file)):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert not {name.split(".")[0] for name in names} & {"mitsuba", "drjit"}, file
@@ -129,7 +139,7 @@ def test_the_parser_of_imports_sees_relative_and_absolute_ones(tmp_path: Path) -
         "import mitsuba_ext.rendering.plan, numpy\n"
         "def late():\n    from mitsuba_ext.composition import slots\n"
     )
-    found = set(_imports(file, ["mitsuba_ext", "decisions", "next_event"]))
+    found = set(_imports(file, ("mitsuba_ext", "decisions", "next_event")))
     assert found == {
         ("decisions", "lights", "weights"), ("decisions", "next_event", "maps", "grid", "Grid"),
         ("bounds",), ("rendering", "plan"), ("composition", "slots"),
@@ -140,7 +150,7 @@ def test_kernels_read_no_memory_of_numpy_that_may_not_be_aligned() -> None:
     """``from_numpy`` aligns it: otherwise kernels differ from one render to the next by chance."""
     found = []
     for file in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(_tree(file)):
             if not (isinstance(node, ast.Call) and node.args):
                 continue
             called, value = ast.unparse(node.func), ast.unparse(node.args[0])
@@ -156,7 +166,7 @@ def test_kernels_read_no_memory_of_numpy_that_may_not_be_aligned() -> None:
 def test_tests_import_from_the_support_folder_only() -> None:
     found = []
     for file in sorted((ROOT / "tests").rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(_tree(file)):
             if isinstance(node, ast.ImportFrom):
                 modules = ["." * node.level + (node.module or "")]
             elif isinstance(node, ast.Import):
@@ -202,13 +212,13 @@ def test_nobody_asks_for_the_class_of_a_technique() -> None:
     """Neither a technique nor its learner, outside of its own folder."""
     homes: dict[str, Path] = {}
     for file, _package in _files(PACKAGE / "techniques"):
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        for node in _tree(file).body:
             if isinstance(node, ast.ClassDef):
                 homes[node.name] = file.parent
     found = []
     for folder in (PACKAGE, *(ROOT / plugins for plugins in PLUGINS)):
         for file in sorted(folder.rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for node in ast.walk(_tree(file)):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
                     kinds = _names(node.args[1]) & set(homes)
                     if any(homes[kind] not in file.parents for kind in kinds):
@@ -218,12 +228,12 @@ def test_nobody_asks_for_the_class_of_a_technique() -> None:
 
 def test_thresholds_of_efficiency_and_costs_are_those_of_the_planner() -> None:
     """What is compared with a gain, an efficiency or a cost has its name from ``planning``."""
-    measures = ("gain", "efficiency", "cost", "worth")
+    measure = re.compile(r"(gain|efficiency|cost)s?\b")
     found = []
     for file, _package in _files(PACKAGE):
         if "planning" in file.relative_to(PACKAGE).parts:
             continue
-        tree = ast.parse(file.read_text(encoding="utf-8"))
+        tree = _tree(file)
         own = {
             target.id
             for node in tree.body if isinstance(node, ast.Assign)
@@ -232,7 +242,6 @@ def test_thresholds_of_efficiency_and_costs_are_those_of_the_planner() -> None:
         }  # fmt: skip
         for node in ast.walk(tree):
             if isinstance(node, ast.Compare) and _names(node) & own:
-                words = ast.unparse(node).lower()
-                if any(measure in words for measure in measures):
+                if measure.search(ast.unparse(node).lower()):
                     found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}")
     assert not found, "\n".join(found)
