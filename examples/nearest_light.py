@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.bases.decision_plugin import DecisionPlugin
+from mitsuba_ext.bases.decision_plugin import register
 from mitsuba_ext.planning.technique import ParameterReader, Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.transport.light_table import LightTable
@@ -48,7 +48,7 @@ class NearestLight:
         return nearest
 
 
-class NearestLightParameters(Technique):
+class NearestLights(Technique):
     """Reads the parameters, and makes the decision for a render.
 
     Attributes:
@@ -56,8 +56,7 @@ class NearestLightParameters(Technique):
             would lack the light of all others.
     """
 
-    name = "nearest_light"
-    slots = ("next_event",)
+    name, slots = "nearest_light", ("next_event",)
 
     def __init__(self, read: ParameterReader) -> None:
         self.share = read("share", 0.7, minimum=0.0, maximum=0.95)
@@ -65,16 +64,10 @@ class NearestLightParameters(Technique):
     def decision(self, setting: Setting) -> LightTable | None:
         count = len(setting.scene.emitters())
         if count < 2:
-            return None  # nothing to choose: the kernel is that of ``path``
+            return None  # nothing to choose: the kernel is path's
         weights = self.share * np.eye(count) + (1 - self.share) / count
         table = from_numpy(mi.Float, weights.astype(np.float32).ravel())
         return LightTable(NearestLight(setting.scene), LightCells(setting.scene, None), table)
 
 
-class NearestLightPlugin(DecisionPlugin):
-    """The plugin that a scene file nests into the slot ``next_event``."""
-
-    kind = NearestLightParameters
-
-
-mi.register_sampler("nearest_light", lambda props: NearestLightPlugin(props))
+register(NearestLights)

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.bases.decision_plugin import DecisionPlugin
+from mitsuba_ext.bases.decision_plugin import register
 from mitsuba_ext.planning.learner import Learner, Pilot
-from mitsuba_ext.planning.technique import ParameterReader, Setting, Technique
+from mitsuba_ext.planning.technique import Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.spectra import brightness
 from mitsuba_ext.transport.light_table import LightTable, OneRow
@@ -48,8 +48,7 @@ class ProvenLights(Learner):
         return self._table(self._sums.numpy().astype(float))
 
     def state(self) -> dict[str, np.ndarray]:
-        """The arrays from which a render that is continued later restores the same
-        probabilities."""
+        """The arrays from which a later render restores the same probabilities."""
         return {"sums": self._sums.numpy()}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightTable:
@@ -65,17 +64,10 @@ class ProvenLights(Learner):
         return f"proven lights: the most likely one has {self._shares.max():.0%} of the choices"
 
 
-class ProvenLightsParameters(Technique):
-    """Makes the learner of a render. There are no parameters to read from the scene."""
+class ProvenLightChoice(Technique):
+    """Makes the learner of a render, from 8 samples per pixel unless ``pilot_spp`` is given."""
 
-    name = "proven_lights"
-    slots = ("next_event",)
-
-    #: Samples per pixel from which it learns, unless the integrator's ``pilot_spp`` says otherwise
-    pilot_spp = 8
-
-    def __init__(self, read: ParameterReader) -> None:
-        pass
+    name, slots, pilot_spp = "proven_lights", ("next_event",), 8
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         return spp > 0 and len(scene.emitters()) > 1
@@ -84,10 +76,4 @@ class ProvenLightsParameters(Technique):
         return ProvenLights() if self.can_learn(setting.scene, setting.pilot_spp) else None
 
 
-class ProvenLightsPlugin(DecisionPlugin):
-    """The plugin that a scene file nests into the slot ``next_event``."""
-
-    kind = ProvenLightsParameters
-
-
-mi.register_sampler("proven_lights", lambda props: ProvenLightsPlugin(props))
+register(ProvenLightChoice)

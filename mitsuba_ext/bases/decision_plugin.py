@@ -41,3 +41,10 @@ class DecisionPlugin(mi.Sampler):
         )
 
     clone = fork = seed = set_sample_count = next_1d = next_2d = _refuse
+
+
+def register(kind: type[Technique]) -> None:
+    """Registers a plugin that reads the parameters of a technique, in the active variant, by the
+    technique's name."""
+    plugin = type(kind.__name__, (DecisionPlugin,), {"kind": kind})
+    mi.register_sampler(kind.name, lambda props: plugin(props))
