@@ -41,8 +41,8 @@ SUBPATH_CHOICE = 0.103
 REJECTION = 0.05
 
 #: The kernels that a render with learning compiles, in units of the time of a kernel of ``path``:
-#: those of its pilots, and of the last stage, are larger, and there are many small ones. And those
-#: of the trial of light paths.
+#: the kernels of its pilots, and of the last stage, are larger, and there are many small ones. The
+#: same for the trial of light paths.
 LEARNING_KERNELS, TRIAL_KERNELS = 6, 4
 
 #: The time to compile the kernels of light paths, in samples of ``path``: as long as two million,

@@ -3,10 +3,10 @@
 The benefit of a decision is the ratio of the efficiencies, 1 / (variance · time), with it and
 without. Variance and time are estimated from pilots:
 
-- Variance: that of the image from the paths of a pilot, and that which these paths would have with
-  the decision of ``path``. The paths are divided into batches, from which the uncertainty of the
-  ratio is estimated. The brightest paths, one in 32768 and one in each pass at least, are left out:
-  they would dominate the estimate.
+- Variance: the variance of the image from the paths of a pilot, and the variance that these paths
+  would have with the decision of ``path``. The paths are divided into batches, from which the
+  uncertainty of the ratio is estimated. The brightest paths, one in 32768 and one in each pass at
+  least, are left out: they would dominate the estimate.
 - Time: segments of paths and shadow rays are counted, and the additional cost of a decision is a
   constant. A clock would be more accurate on an idle machine, but renders with equal seeds could
   choose differently, above all on a busy machine.

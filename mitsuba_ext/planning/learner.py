@@ -55,7 +55,7 @@ class Learner(Observer):
 
     def state(self) -> dict[str, np.ndarray]:
         """The arrays that determine the decision of the last stage, once it has been learned; empty
-        where it is that of Mitsuba's ``path``."""
+        where it is the one of Mitsuba's ``path``."""
         return {}
 
     def restore(self, scene: mi.Scene, state: StoredArrays) -> Any | None:
@@ -69,7 +69,7 @@ class Learner(Observer):
     @property
     def effect(self) -> Effect | None:
         """What is known about the decision of the last stage; ``None`` if nothing was tried, or if
-        the effect is part of that of another learner."""
+        the effect is part of another learner's."""
         return None
 
     def shadow_test(self, law: Any) -> Learner:
@@ -84,7 +84,7 @@ class Learner(Observer):
 
     @property
     def efficiency(self) -> float:
-        """The efficiency that its decision has in the pilots, relative to that of ``path``."""
+        """The efficiency of its decision in the pilots, relative to ``path``."""
         return 1.0
 
     @property
@@ -100,7 +100,7 @@ class Learner(Observer):
     def beside_light_paths(self, time: float) -> Learner:
         """A learner that begins with this one's decision, and learns from camera paths that bring
         less light from now on, because light paths bring the rest. ``time`` is the time of a
-        sample, in units of that of ``path``."""
+        sample, relative to ``path``."""
         raise NotImplementedError
 
     def start_again(self) -> Any | None:

@@ -89,7 +89,7 @@ def first_parts(pixel_count: int, spp: int) -> int:
 
 
 def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
-    """For each stage, the weight of its samples relative to those of the last stage. Where maps
+    """For each stage, the weight of its samples relative to the last stage. Where maps
     help much, equal weights would leave most of the noise to samples of the first stages. Where
     maps do not help, unequal weights raise the variance by 1.5 % at most, which limits them.
 

@@ -105,7 +105,7 @@ class Planner(Schedule):
         self._doubles = any(technique.doubles for technique in learning_ones)
         self._only_doubles = all(technique.doubles for technique in learning_ones)
         self._most_lanes = min((t.most_lanes for t in learning_ones if t.most_lanes), default=0)
-        #: For each stage, the weight of its samples relative to those of the last stage
+        #: For each stage, the weight of its samples relative to the last stage
         self._weights = stage_weights(stages) if self._doubles else [1.0] * len(stages)
         self._learning, self._savers = learning, savers
         self._states: dict[str, dict[str, np.ndarray]] = {}

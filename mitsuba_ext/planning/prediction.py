@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Prediction:
-    """What pilots predict of a learned decision, relative to that of ``path``.
+    """What pilots predict of a learned decision, relative to the decision of ``path``.
 
     Attributes:
         variance: The variance with it, divided by the variance without it.
@@ -35,7 +35,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Effect:
-    """The effect of a learned decision, relative to that of ``path``, as far as pilots can tell.
+    """The effect of a learned decision, relative to ``path``, as far as pilots can tell.
 
     Attributes:
         is_kept: Whether the last stage uses it.

@@ -47,8 +47,8 @@ class PredictionCheck:
         self.error = 0.0
 
     def failed(self, time: float, rival: float) -> bool:
-        """Is what was chosen less efficient than its rival, by more than the error of this
-        measurement?
+        """Whether what was chosen is less efficient than its rival, by more than the error of this
+        measurement.
 
         Parameters:
             time: The time of a sample of it, in units of that to which ``of_rival`` belongs.

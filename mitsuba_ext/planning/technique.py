@@ -55,7 +55,7 @@ class Setting:
 
 
 class ParameterReader:
-    """Reads the parameters of a decision from those of a plugin.
+    """Reads the parameters of a technique from the parameters of a plugin.
 
     Parameters:
         plugin: The plugin's name in error messages.

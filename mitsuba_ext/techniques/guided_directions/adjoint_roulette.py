@@ -57,9 +57,9 @@ class AdjointRoulette(Roulette):
 
     @classmethod
     def by_throughput(cls, regions: Regions, count: int, pixels: int) -> AdjointRoulette:
-        """A roulette that knows nothing yet, of ``count`` regions and so many pixels: it ends paths
-        of low throughput. With it, the pilot that learns the first radiances has the kernel of
-        those after it."""
+        """A roulette that knows nothing yet, of numbers of regions and pixels: it ends paths of low
+        throughput. With it, the pilot that learns the first radiances has the kernel of the pilots
+        after it."""
         return cls(regions, dr.full(mi.Float, _CERTAIN, count), dr.full(mi.Float, 1, pixels))
 
     def state(self) -> dict[str, np.ndarray]:

@@ -36,8 +36,8 @@ class Regions(Protocol):
 
 class GuidedDirections(DirectionSamples):
     """Draws the samples of a path's first directions from trees. The throughput after a bounce is
-    divided by the density of its sample. MIS weights remain those of uniform samples, which is
-    unbiased, also beside light paths, as they add up to one for each path.
+    divided by the density of its sample. MIS weights remain the weights of uniform samples. That is
+    unbiased, also beside light paths, because they add up to one for each path.
 
     Parameters (and attributes):
         trees: Densities of samples.

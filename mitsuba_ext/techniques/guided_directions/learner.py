@@ -89,7 +89,7 @@ class GuideLearner(Learner):
         self._rr_depth: int | None = None
         self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
         self.pixel_count = film_size[0] * film_size[1]
-        #: The time of a sample, in units of that of ``path`` without guides
+        #: The time of a sample, relative to ``path`` without guides
         self._time = 1.0
         self.sample_count = 0
         self._records: PathRecords | None = None
@@ -140,7 +140,7 @@ class GuideLearner(Learner):
         return GUIDES_GROW if self.learns_beside_light_paths else 1.0
 
     def beside_light_paths(self, time: float) -> GuideLearner:
-        # MIS weights are those of unguided paths, which light paths may have as well
+        # Guides do not change MIS weights, which light paths share
         other = GuideLearner(
             self.make_regions, self.wants_scout, self.bounces, self.max_memory,
             self.pilot_samples, self._film_size, self.always,

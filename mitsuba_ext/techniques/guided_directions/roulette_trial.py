@@ -31,7 +31,7 @@ class Effect(NamedTuple):
     segments: float
 
     def efficiency(self, other: Effect) -> float:
-        """The efficiency, relative to that of ``other``."""
+        """The efficiency, relative to ``other``."""
         return other.variance * other.segments / max(self.variance * self.segments, 1e-30)
 
 
@@ -40,8 +40,8 @@ class RouletteTrial(Observer):
 
     Let a path gather the radiance ``V_j`` after bounce j, and ``V`` in all. Other densities and
     survival probabilities would multiply ``V_j`` by ``A_j``, and make such paths rarer by the same
-    factor. The mean square would then be that of V² + Σ (A_j − A_{j−1}) V_j², where A is 1 before
-    the first bounce.
+    factor. The mean square would then be the mean of V² + Σ (A_j − A_{j−1}) V_j², where A is 1
+    before the first bounce.
 
     Parameters:
         stride: At most one in ``stride`` paths is recorded.

@@ -15,7 +15,7 @@ from ...util.stored_arrays import StoredArrays
 #: The value that marks a leaf, in place of a probability.
 LEAF = -1.0
 
-#: Bits of a probability in a packed node. The density is that of the rounded probabilities.
+#: Bits of a probability in a packed node. The density is computed from the rounded probabilities.
 _BITS = 9
 _ONE = 1 << _BITS
 
@@ -41,7 +41,7 @@ class SampleTrees:
     Parameters:
         probability: The probability of each node's left child; ``LEAF`` for a leaf. Shape [nodes].
         child: The left child's number; the right one follows it. Shape [nodes].
-        is_even: Is the node split along the first axis? Shape [nodes].
+        is_even: Whether the node is split along the first axis. Shape [nodes].
         root: The first node of each tree; it is split along the first axis, or a leaf. [trees].
         share: The share of the samples that follow the tree, in [0, 1]; the others are uniform.
             Shape [trees].
@@ -115,7 +115,7 @@ class SampleTrees:
     @classmethod
     def _of(cls, nodes: np.ndarray, values: np.ndarray, share: np.ndarray) -> SampleTrees:
         trees = cls.__new__(cls)
-        # As integers: bit patterns of nodes may be those of NaNs
+        # As integers: bit patterns of nodes may look like NaNs
         trees._nodes = dr.reinterpret_array(mi.Float, from_numpy(mi.UInt32, nodes))
         trees._values, trees.share = from_numpy(mi.UInt32, values), from_numpy(mi.Float, share)
         dr.eval(trees._nodes, trees._values, trees.share)
@@ -174,7 +174,7 @@ class SampleTrees:
         """Goes down to a leaf: by the probabilities where ``by_tree``, else to the leaf that
         contains ``u``."""
         x, y = mi.Float(u.x), mi.Float(u.y)       # Coordinates of the sample within its cell
-        column, row = mi.UInt32(0), mi.UInt32(0)  # Number of the cell among those of its size
+        column, row = mi.UInt32(0), mi.UInt32(0)  # Number of the cell among cells of its size
         edge = mi.Float(1)                        # Edge of the cell
         density = mi.Float(1)
         node = mi.UInt32(root)
@@ -202,7 +202,7 @@ class SampleTrees:
 
 
 def _end_in_leaves(nodes: np.ndarray) -> bool:
-    """Do all ways down packed nodes end in a leaf?"""
+    """Whether all ways down packed nodes end in a leaf."""
     side = np.arange(4, dtype=np.uint32)
     is_leaf = (nodes[:, :1] >> (3 * _BITS + side)) & 1 == 1
     child = np.where(is_leaf, 0, nodes[:, 1:].astype(np.int64) + side)

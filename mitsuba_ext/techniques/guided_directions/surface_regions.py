@@ -59,7 +59,7 @@ class SurfaceRegions:
         return ()
 
     def tree(self, state: tuple, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """The tree of a vertex: that of the smallest region that contains it."""
+        """The tree of the smallest region that contains a vertex."""
         return self.label(si, None, active)
 
     def after(

@@ -134,7 +134,7 @@ class TileRegions:
         return builder, joined(roots), joined(below)
 
     def _add_tiles(self, builder: TreeBuilder, samples: Samples, tile: mi.UInt32) -> mi.UInt32:
-        """Adds the trees of all tiles, those of large tiles first; returns the roots of the small
+        """Adds the trees of all tiles, large tiles first; returns the roots of the small
         ones."""
         row, column = np.divmod(np.arange(self.count, dtype=np.uint32), self._columns)
         number, roots = np.zeros(self.count, np.uint32), None

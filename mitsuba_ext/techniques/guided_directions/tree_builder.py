@@ -90,7 +90,7 @@ class SortedSamples(Samples):
         self.tree, self.code = key >> DEPTH, key & ((1 << DEPTH) - 1)
 
     def merged(self) -> SortedSamples:
-        """One sample instead of all those of the same tree and cell."""
+        """One sample instead of all samples of the same tree and cell."""
         index, count = dr.arange(mi.UInt32, len(self.key)), dr.opaque(mi.UInt32, len(self.key))
         following = dr.gather(mi.UInt32, self.key, index + 1, index + 1 < count)
         last = dr.compress((index + 1 == count) | (self.key != following))
@@ -163,7 +163,7 @@ class TreeBuilder:
             expected: For each tree, the root of the earlier tree that is its prior.
 
         Returns:
-            The node of the first tree; those of the others follow.
+            The node of the first tree; the nodes of the others follow.
         """
         most = dr.opaque(mi.UInt32, tree_count)
         return self.add_sorted(samples.in_order(dr.minimum(tree, most)), 0, tree_count, expected)

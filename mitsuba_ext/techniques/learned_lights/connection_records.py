@@ -177,6 +177,6 @@ class ConnectionRecords(Observer):
 
     def predicted_gain(self, ratio: mi.Float) -> float:
         """The relative reduction of variance by a choice with which the mean squares of the
-        connections of each row are ``ratio`` times those of Mitsuba's choice; shape [rows]."""
+        connections of each row are ``ratio`` times the ones of Mitsuba's choice; shape [rows]."""
         removed = float(dr.sum(self.row_squares * mi.Float64(1 - ratio))[0])
         return removed / max(self.variance, 1e-30)

@@ -96,7 +96,7 @@ class LightMapLearner(Learner):
         self._about: dict[str, float] = {}
         self._is_kept: bool | None = None
         self._is_tested = False
-        # Makes a finer map than that of the first pilot, with the same bins of the environment
+        # Makes a finer map than the first pilot had, with the same bins of the environment
         self._finer_map: Callable[[], LightMap] | None = None
         self._bins: EnvironmentBins | None = None
 

@@ -117,7 +117,7 @@ class LightMap(Observer):
         return mi.UInt32(self._counts >> 32)
 
     def restore(self, tests: mi.UInt32, successes: mi.UInt32, squares: mi.UInt64) -> None:
-        """Sets the counts to those of another map with the same rows and cells."""
+        """Takes over the counts of another map with the same rows and cells."""
         self._counts = mi.UInt64(tests) | (mi.UInt64(successes) << 32)
         self.squares = mi.UInt64(squares)
         self.evaluate()

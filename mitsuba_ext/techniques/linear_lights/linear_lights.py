@@ -35,7 +35,7 @@ class Estimates:
 
     Attributes:
         normal: Shading normal, on the side that is seen.
-        is_opaque: Does only light from the side of the normal contribute?
+        is_opaque: Whether only light from the side of the normal contributes.
         total: Sum of the estimates of all emitters.
     """
 
@@ -135,7 +135,7 @@ class LinearChoice(EmitterSampling):
         return place[0] if self.count > 1 else ()
 
     def density(self, state, scene, ref, si, ds, active):
-        # Whole emitters: the number of a cell is that of its emitter
+        # Whole emitters: the number of a cell is the number of its emitter
         index, pdf = self.cells.pdf(ref, si, ds, active)
         if self.count > 1:
             e = self._estimate(index, ref.p, state.normal, state.is_opaque, active)
@@ -183,7 +183,7 @@ class LinearChoice(EmitterSampling):
             searching &= (running <= target) & (block + 1 < self._block_count)
             block += dr.select(searching, 1, 0)
 
-        # The sums are those of the first pass. Only by rounding can all stay below the target: then
+        # The sums are from the first pass. Only by rounding can all stay below the target: then
         # the last visited emitter whose estimate is not zero is chosen
         index = block * self._block
         searching = mi.Bool(is_searched)

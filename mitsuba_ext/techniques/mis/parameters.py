@@ -23,7 +23,7 @@ _MAKERS: Mapping[str, Callable[[Any], Weights]] = MappingProxyType(
     }
 )
 
-#: Names of heuristics; the first is that of ``path``.
+#: Names of heuristics; the first is the one of ``path``.
 HEURISTICS = tuple(_MAKERS)
 
 

@@ -30,7 +30,7 @@ class _Reservoir:
     Attributes:
         total: Sum of the weights.
         number: The rest of the random number that chooses, in [0, 1).
-        ds: The chosen candidate. Its density is that of the candidates, times their number.
+        ds: The chosen candidate. Its density is the density of the candidates, times their number.
         value: Its radiance.
         target: Its contribution if it is not occluded.
     """
@@ -55,7 +55,7 @@ class ResampledLights(EmitterSampling):
     a lattice that is shifted at random.
 
     **MIS.** The density of the chosen direction is unknown, and not needed: the expectation above
-    holds for f times any weight w(y) as well, so that weights are unbiased if those of both
+    holds for f times any weight w(y) as well, so that weights are unbiased if the weights of both
     techniques add up to one in each direction. Those of :class:`Weights` do, for any function that
     both evaluate in place of the density. Here it is the density of all candidates, M_l p_l + M_b
     p_b, which the choice improves upon.

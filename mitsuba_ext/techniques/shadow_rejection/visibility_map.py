@@ -75,7 +75,7 @@ class VisibilityMap:
         }
 
     def restore(self, state: StoredArrays) -> None:
-        """Sets the counters to those of a map of the same scene and grid.
+        """Takes over the counters of a map of the same scene and grid.
 
         Raises:
             DamagedError: They are no such counters.

@@ -62,8 +62,8 @@ class VisibilityRoulette(ShadowTest):
 
 
 def has_lights_at_points(scene: mi.Scene) -> bool:
-    """Is there a light in the voxels of the map? (Lights at infinity, and point lights outside of
-    the bounds of the shapes, are not.)"""
+    """Whether there is a light in the voxels of the map. (Lights at infinity, and point lights
+    outside of the bounds of the shapes, are not.)"""
     bounds = scene_bounds(scene)
     if not bounds.valid():
         return False

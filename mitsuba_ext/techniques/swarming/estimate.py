@@ -1,8 +1,8 @@
 """Estimates densities over cells for all tiles of a film, from few samples of each.
 
-The estimate of a tile is a compromise between its own counts and those of the larger tile around
-it, which weigh more the less the two differ beyond chance: an empirical Bayes estimate. It proceeds
-from the largest tiles, whose prior is uniform, to the smallest, and in each tile from the root of
+The estimate of a tile is a compromise between its own counts and the counts of the larger tile
+around it, which weigh more the less the two differ beyond chance: an empirical Bayes estimate. It
+proceeds from the largest tiles, whose prior is uniform, to the smallest, and in each tile from the root of
 the tree of cells to its leaves. At a node, with ``h`` the share of the left half among ``n``
 samples, and ``p`` its estimate in the tile around, it is the mean of a beta distribution::
 
@@ -39,7 +39,7 @@ class Form(NamedTuple):
     """How the density of a cell follows from the contributions of its samples.
 
     Attributes:
-        is_root: Is it in proportion to the root of the mean of a cell, and not to the mean? The
+        is_root: Whether it is in proportion to the root of the mean of a cell, not to the mean. The
             variance is least with the mean where all samples of a cell contribute the same, and
             with the root where some of them contribute nothing.
         floor: The share of uniform numbers.
@@ -108,7 +108,7 @@ class Grid:
         return (row * self._columns + column) * self.maps + which
 
     def has(self, row: mi.UInt32, column: mi.UInt32) -> mi.Bool:
-        """Is there such a tile?"""
+        """Whether there is such a tile."""
         return (row <= self._last_row) & (column <= self._last_column)
 
     def nearest(self, row: mi.Int32, column: mi.Int32) -> tuple[mi.UInt32, mi.UInt32]:
@@ -129,7 +129,7 @@ def estimate(counts: mi.Float, squares: mi.Float, grid: Grid, widths: mi.Float) 
         widths: The share of each cell among uniform numbers, which is the first prior.
 
     Returns:
-        Shares, in the order of ``counts``; those of a table add up to one.
+        Shares, in the order of ``counts``; the shares of a table add up to one.
     """
     cells = len(widths)
     levels = [(grid, counts, squares)]
@@ -212,7 +212,7 @@ def _updated(
     grid: Grid, nodes: Nodes, shares: mi.Float, variance: mi.Float, counts: mi.Float,
     squares: mi.Float,
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-    """Combines the counts of each tile with ``shares``, those of the tile around it, which have
+    """Combines the counts of each tile with ``shares`` of the tile around it, which have
     this ``variance``: by node, the share of the left half, and its variance."""
     cells = nodes.cells
     own_before, expected_before = sums_before(counts, cells), sums_before(shares, cells)

@@ -106,8 +106,9 @@ class MapLearner(Learner):
 
     # ---- For subclasses ----
 
-    #: Are maps used only after a stage has measured their gain? Where another distribution takes a
-    #: part of the decisions, the gain that is predicted against uniform numbers means nothing.
+    #: Whether maps are used only after a stage has measured their gain. Where another
+    #: distribution takes a part of the decisions, the gain that is predicted against uniform numbers
+    #: means nothing.
     needs_measurement = False
 
     def choices(self, radiance: mi.Float) -> Choices:
@@ -122,7 +123,7 @@ class MapLearner(Learner):
 
     @property
     def is_learning(self) -> bool:
-        """Are the samples of the running stage recorded?"""
+        """Whether the samples of the running stage are recorded."""
         return self._counts is not None
 
     # ---- Observer ----

@@ -55,7 +55,7 @@ class LightChoice:
 
     Attributes:
         cell, density: The cell of the numbers in the map, and their density.
-        is_mapped: Is this the connection whose numbers have a map?
+        is_mapped: Whether this is the connection whose numbers have a map.
     """
 
     cell: mi.UInt32
@@ -65,8 +65,8 @@ class LightChoice:
 
 class MappedLights(EmitterSampling):
     """Warps the numbers of another next event decision, at the first vertex of a path that is
-    connected to lights. MIS weights remain those of uniform numbers, which is unbiased, as they add
-    up to one in each direction.
+    connected to lights. MIS weights remain the weights of uniform numbers. That is unbiased,
+    because they add up to one in each direction.
 
     Parameters:
         inner: The decision that uses the numbers.
@@ -108,7 +108,7 @@ class LightMaps:
     Attributes:
         cells, maps, tiles: See
             :class:`~mitsuba_ext.techniques.swarming.mapped_numbers.MappedNumbers`.
-        is_recorded: Are choices recorded for a learner?
+        is_recorded: Whether choices are recorded for a learner.
     """
 
     def __init__(self, cells: Cells) -> None:

@@ -42,7 +42,7 @@ def lobe_cells() -> Cells:
 
 
 def divides(shapes) -> bool:
-    """May a path be reflected or transmitted at any of these shapes?"""
+    """Whether a path may be reflected or transmitted at one of these shapes."""
     return any(
         bool(shape.bsdf() and _flags(shape.bsdf().flags()))
         or shape.class_name() == "Instance"
@@ -52,7 +52,7 @@ def divides(shapes) -> bool:
 
 
 def _flags(flags):
-    """Has a BSDF with these flags lobes of both kinds?"""
+    """Whether a BSDF with these flags has lobes of both kinds."""
     F = mi.BSDFFlags
     reflects = F.DiffuseReflection | F.GlossyReflection | F.DeltaReflection
     transmits = F.DiffuseTransmission | F.GlossyTransmission | F.DeltaTransmission
@@ -65,7 +65,7 @@ class MappedLobes(DirectionSamples):
     Attributes:
         cells, maps, tiles: See
             :class:`~mitsuba_ext.techniques.swarming.mapped_numbers.MappedNumbers`.
-        is_recorded: Are choices recorded for a learner?
+        is_recorded: Whether choices are recorded for a learner.
         records: The choices of the running pass; ``None`` if they are not recorded.
     """
 

@@ -25,12 +25,12 @@ _BITS = 5
 
 
 class MappedScattering(Scattering):
-    """Mixes directions of a map with those of the BSDF. Its densities are those of the mixture.
+    """Mixes directions of a map with BSDF samples. Its densities are the densities of the mixture.
 
     Attributes:
         cells, maps, tiles: See
             :class:`~mitsuba_ext.techniques.swarming.mapped_numbers.MappedNumbers`.
-        is_recorded: Are choices recorded for a learner?
+        is_recorded: Whether choices are recorded for a learner.
         cell, density, inverse, lane: The choices of the lanes of the running pass, if recorded: the
             cell, the density of the mixture over that of the BSDF, uniform density over that of the
             BSDF, and the lane.
@@ -119,7 +119,7 @@ class MappedScattering(Scattering):
 
 
 def is_smooth(vertex: Vertex) -> mi.Bool:
-    """Has the BSDF a lobe that is not specular?"""
+    """Whether the BSDF has a lobe that is not specular."""
     return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
 

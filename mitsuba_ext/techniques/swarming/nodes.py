@@ -25,7 +25,7 @@ class Nodes:
     Attributes:
         cells: See above.
         table: The table of each lane.
-        exist: Is the lane a node?
+        exist: Whether the lane is a node.
     """
 
     def __init__(self, tables: int, cells: int) -> None:

@@ -22,7 +22,7 @@ _ONE, _ONE_X, _ONE_X2 = 2.0**12, 2.0**16, 2.0**12
 #: of the tile; their squares to the second when gains are measured.
 _LARGEST, _LARGEST_MEASURED = 32.0, 4096.0
 
-#: The largest radiance that is counted, in units of that of the film.
+#: The largest radiance that is counted, in units of the mean radiance of the film.
 _BRIGHTEST = 1024.0
 
 #: Added to the squared radiance of a tile, in units of the squared mean of the film.
@@ -47,7 +47,7 @@ class Choices:
         scale: The density of uniform numbers, in units of the density of that other distribution;
             used where ``share`` is below 1. ``density`` is in these units then.
         later: The part of ``value`` after later choices of the same path. It is measured with
-            these, whose ``density`` is that of both choices, and not a second time here.
+            these, whose ``density`` contains both choices, and not a second time here.
     """
 
     map: mi.UInt32
@@ -186,7 +186,7 @@ class TileCounts:
         dr.scatter_add(self._counts, fixed, cell, choices.active)
         wide = mi.UInt64(fixed)
         dr.scatter_add(self._squares, (wide * wide) // int(_ONE), table, choices.active)
-        # The square without that of the later part, which is measured with the later choice
+        # The square without the square of the later part, which is measured with the later choice
         square, square_of_later = (
             dr.minimum(dr.square(x), _LARGEST_MEASURED) for x in (value, later)
         )

@@ -347,7 +347,7 @@ class Partitioner:
 
 
 def _choose(probability: mi.Float, number: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Is the first of two chosen? And the rest of the random number, stretched to [0, 1)."""
+    """Whether the first of two is chosen; the rest of the random number, stretched to [0, 1)."""
     is_first = number < probability
     number = number - dr.select(is_first, 0, probability)
     number /= dr.select(is_first, probability, 1 - probability)

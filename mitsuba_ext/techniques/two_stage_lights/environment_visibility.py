@@ -32,7 +32,7 @@ class Tile:
 
     Attributes:
         number: Number of the tile.
-        is_known: Do the maps apply to this vertex? Later vertices of a path lie elsewhere.
+        is_known: Whether the maps apply to this vertex. Later vertices of a path lie elsewhere.
     """
 
     number: mi.UInt32
@@ -44,8 +44,8 @@ class Cell:
     """Where a connection lies in the maps.
 
     Attributes:
-        index: The number of the cell, that of its tile included.
-        is_known: Does the connection belong to a cell?
+        index: The number of the cell among the cells of all tiles.
+        is_known: Whether the connection belongs to a cell.
     """
 
     index: mi.UInt32

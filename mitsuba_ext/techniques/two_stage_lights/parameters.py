@@ -40,7 +40,7 @@ class TwoStageLights(Technique):
 
     @property
     def learns(self) -> bool:
-        """Does it learn the visibility?"""
+        """Whether it learns the visibility."""
         return self.visibility != "unknown"
 
     @property

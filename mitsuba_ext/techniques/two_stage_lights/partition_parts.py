@@ -51,7 +51,7 @@ class Branch:
     """The place of a rectangle in the tree.
 
     Attributes:
-        weight: The weight of the rectangle, or the sum of those of its parts.
+        weight: The weight of the rectangle, or the sum of the weights of its parts.
         link: The first of its two parts, which follow each other; 0 for a leaf.
     """
 

@@ -32,7 +32,7 @@ class State:
         density: The density with which a connection to the environment would have found the
             direction in which the path has left; valid where ``has_partition``.
         has_partition: Did the last vertex have a partition?
-        is_first: Is there no last vertex?
+        is_first: Whether there is no last vertex.
         tile: Number of the film tile in which the path begins.
     """
 
@@ -48,7 +48,7 @@ class Place:
 
     Attributes:
         partition: The partition of the environment, where ``has_partition``.
-        has_partition: Has it a partition? Elsewhere, lights are chosen as Mitsuba does.
+        has_partition: Whether it has a partition. Elsewhere, lights are chosen as Mitsuba does.
         tile: Selects the maps of visibility.
     """
 
@@ -64,9 +64,9 @@ class TwoStage(EmitterSampling):
     Parameters:
         scene: A scene with an environment emitter.
         splits: See :class:`Partitioner`.
-        everywhere: Are there partitions at all vertices of a path, not only at the first?
+        everywhere: Whether there are partitions at all vertices of a path, not only at the first.
         counts: Finds the cell of a connection, for learning.
-        in_primary_space: Are its cells those of random numbers (or of directions)?
+        in_primary_space: Whether its cells divide random numbers; if not, directions.
         visibility: The learned visibility of the environment from first vertices.
         sums: Sums over the texels of the environment; made here if ``None``.
     """

@@ -62,7 +62,7 @@ class WeightedSets:
         table = np.ones((self._set_count, count, columns + columns % 2), np.float32)
         for rows in table:
             x = points(pattern, count, dimension, rng)
-            # Without the shuffle, their order could be correlated with that of the film's sampler
+            # Without the shuffle, their order could be correlated with the film's sampler
             rng.shuffle(x)
             rows[:, :dimension] = x
             if weights != "none":
