@@ -65,6 +65,16 @@ if TYPE_CHECKING:
     "the scene: volpath or volpathmis in media, bdpt for lights that no camera path finds]",
 )
 @click.option(
+    "--no-reference", is_flag=True,
+    help="Take the variance between the seeds as the error. Bias shows in the means of the images "
+    "only.",
+)
+@click.option(
+    "--cpu", is_flag=True,
+    help="Measure CPU time of all threads instead of the wall clock, on a machine that does other "
+    "work.",
+)
+@click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
     shell_complete=candidates.folders,
     help="Folder for report.html, results.json, the images, and rendered references. Runs that it "
@@ -94,6 +104,8 @@ def compare(
     reference: Path | None,
     reference_spp: int | None,
     reference_integrator: str | None,
+    no_reference: bool,
+    cpu: bool,
     out: Path,
     limit: float | None,
     workers: int | None,
@@ -124,6 +136,8 @@ def compare(
         raise click.UsageError(f"give one of {', '.join(given)}")
     if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
+    if no_reference and (reference or reference_spp or reference_integrator):
+        raise click.UsageError("--no-reference and other options of references exclude each other")
     check_executor(workers, dask)
     scenes, integrators = _sort_out(names)
     if not plugins:
@@ -160,6 +174,8 @@ def compare(
         reference_integrator=reference_integrator,
         command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
         only_stored=worker == supervisor.STORED,
+        with_reference=not no_reference,
+        cpu_time=cpu,
         reference_workers=_reference_workers(executors, workers, dask, tuple(plugins)),
         warn=lambda remark: say(f"mitsuba-ext: warning: {remark}"),
     )

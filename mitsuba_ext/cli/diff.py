@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _FIGURES = {
     "relmse": "relMSE",
     "relmse_trimmed": "relMSE, trimmed",
+    "relmse_worst": "relMSE, 99th percentile",
     "mse": "MSE",
     "rmse": "rMSE",
     "sigma_mu": "σ/μ",

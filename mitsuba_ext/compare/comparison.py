@@ -85,13 +85,18 @@ class Comparison:
             cores cannot be compared.
         command: The command line, for the report.
         only_stored: Render nothing; make figures and report from the runs in the folder.
+        with_reference: ``False`` needs no reference: errors are the variance between the seeds,
+            which does not contain bias.
+        cpu_time: Measure the CPU time of all threads, which other programs on the machine hardly
+            change, instead of the wall clock.
         warn: Called with each remark about a scene, its reference and its stored runs as soon as it
             is known; the results hold them too.
 
     Raises:
         InputError: No scene was given, an integrator cannot be made, ``budget`` is no
-            :class:`Budget`, ``seeds`` is below 1, the variant is a scalar one, or the name of the
-            folder is empty.
+            :class:`Budget`, ``seeds`` is below 1 (2 without a reference), ``until`` has no
+            reference, the variant is a scalar one, or CPU time is asked for and it is not an LLVM
+            one, or the name of the folder is empty.
     """
 
     def __init__(
@@ -105,6 +110,8 @@ class Comparison:
         reference_integrator: Specification | None = None,
         command: str | None = None,
         only_stored: bool = False,
+        with_reference: bool = True,
+        cpu_time: bool = False,
         reference_workers: ReferenceWorkers | None = None,
         warn: Callable[[str], None] = lambda remark: None,
     ) -> None:
@@ -122,14 +129,23 @@ class Comparison:
                 f"the budget must be made by equal_samples(64), equal_time(10), sweep([4, 16, 64]) "
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
+        if not with_reference and (budget.target or seeds < 2):
+            raise InputError(
+                "without a reference, errors are the variance between seeds: this needs at least 2 "
+                "seeds, and a budget of samples or time"
+            )
+        if cpu_time and not mi.variant().startswith("llvm"):
+            raise InputError(f'CPU time needs an LLVM variant, found "{mi.variant()}"')
         make_all(integrators)  # to report an unknown name before a reference is rendered
-        is_needed = not all(setup.reference for setup in self.scenes)
+        is_needed = with_reference and not all(setup.reference for setup in self.scenes)
         if reference_integrator is not None and is_needed:
             make_named(reference_integrator)
         self.integrators = integrators
         self.budget = budget
         self.seeds = seeds
         self.command = command
+        self._with_reference = with_reference
+        self._cpu_time = cpu_time
         self._reference_spp = reference_spp
         self._reference_integrator = reference_integrator
         self._reference_workers = reference_workers
@@ -191,6 +207,8 @@ class Comparison:
             "command": self.command,
             "state": "finished" if self.is_finished else "interrupted",
             "budget": {"kind": self.budget.kind, "values": self.budget.values},
+            "errors": "to the reference" if self._with_reference else "between seeds",
+            "clock": "cpu" if self._cpu_time else "wall",
             "seeds": self.seeds,
             "scenes": self._records,
             "versions": versions(),
@@ -216,7 +234,7 @@ class Comparison:
         )  # fmt: skip
         experiment = Experiment(
             scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored,
-            self._warn,
+            self._cpu_time, self._warn,
         )  # fmt: skip
 
         def report_step(step: Step) -> None:
@@ -227,16 +245,23 @@ class Comparison:
             image_files.check_comparable(scene.scene.sensors()[0].film())
         except InputError as error:
             raise InputError(f"{scene.source}: {error}") from error
-        if setup.reference:
-            reference = references.load_reference(setup.reference, scene.size)
-            self._remark_on_file(experiment, reference)
-        else:
-            reference = self._render_reference(experiment, report_step)
-        if reference is None:
-            return
+        reference = None
+        if self._with_reference:
+            reference = self._reference_of(setup, experiment, report_step)
+            if reference is None:
+                return
         self._running = (name, experiment)
         experiment.run(reference, report_step)
         self._keep_record()
+
+    def _reference_of(
+        self, setup: SceneSetup, experiment: Experiment, progress: Callable[[Step], None]
+    ) -> Reference | None:
+        if not setup.reference:
+            return self._render_reference(experiment, progress)
+        reference = references.load_reference(setup.reference, experiment.scene.size)
+        self._remark_on_file(experiment, reference)
+        return reference
 
     def _remark_on_file(self, experiment: Experiment, reference: Reference) -> None:
         """Remarks on a reference that the user gives."""

@@ -1,5 +1,7 @@
 """Measures the time and error of several integrators on one scene, under equal conditions.
 
+- Errors are measured against a reference, or, without one, between the seeds of each integrator.
+
 - Every integrator gets the settings of the scene's own (``max_depth``, ``rr_depth``,
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
 - Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
@@ -46,7 +48,7 @@ _MAX_UNTIL_SPP = 1 << 16
 
 
 class Experiment:
-    """Renders one scene with several integrators and measures them against a reference.
+    """Renders one scene with several integrators and measures them.
 
     Args:
         scene: The scene. Of its own integrator, only the settings are used.
@@ -56,6 +58,7 @@ class Experiment:
         rounds: Runs of each integrator at each level.
         folder: Stores the runs; those that it already holds are not rendered again.
         only_stored: Use the stored runs only, and render nothing.
+        cpu_time: Measure the CPU time of all threads, not the wall clock.
         warn: Called with each sentence that is added to :attr:`remarks`.
 
     Attributes:
@@ -73,9 +76,11 @@ class Experiment:
         rounds: int,
         folder: Path,
         only_stored: bool = False,
+        cpu_time: bool = False,
         warn: Callable[[str], None] = lambda remark: None,
     ) -> None:
         self.only_stored = only_stored
+        self._cpu_time = cpu_time
         self.remarks: list[str] = []
         self._warn = warn
         self.scene = scene
@@ -94,6 +99,7 @@ class Experiment:
                 "size": scene.size,
                 "versions": versions(),
                 "machine": machine(),
+                **({"clock": "cpu"} if cpu_time else {}),
             },
         )
         self._progress: Callable[[Step], None] = lambda _step: None
@@ -110,19 +116,24 @@ class Experiment:
         self._warn(sentence)
 
     def run(
-        self, reference: Reference, progress: Callable[[Step], None] = lambda _step: None
+        self, reference: Reference | None, progress: Callable[[Step], None] = lambda _step: None
     ) -> None:
         """Measures everything. The results are in :attr:`contenders`, also after an interruption.
 
         Args:
-            reference: The image against which errors are measured.
+            reference: The image against which errors are measured; ``None`` to measure them between
+                the seeds.
             progress: Called before each run.
         """
         self.reference = reference
         self._progress = progress
         schedule = self._schedule_until() if self.budget.target else self._schedule_levels()
-        for contender, index, round in schedule:
-            self._attempt(contender, lambda c=contender, i=index, r=round: self._take(c, i, r))
+        try:
+            for contender, index, round in schedule:
+                self._attempt(contender, lambda c=contender, i=index, r=round: self._take(c, i, r))
+        finally:
+            if reference is None:
+                self._compare_seeds()
 
     # ---- Which run is next ----
 
@@ -186,13 +197,24 @@ class Experiment:
             self._progress(Step(contender.label, self._done, self._seconds_left()))
             with marked(self._mark(contender)):
                 run = self._measure(contender, index, round, path)
-        reference = self.reference
-        run.errors = metrics.errors(run.image(), reference.mean, reference.variance)
+        if (reference := self.reference) is not None:
+            run.errors = metrics.errors(run.image(), reference.mean, reference.variance)
         contender.runs.append(run)
         contender._pace = run.seconds / run.spp
         self._done += run.seconds
         if not self.only_stored:
             self._share_session(contender, run)
+
+    def _compare_seeds(self) -> None:
+        """Measures the errors of all runs between the seeds of each integrator and level."""
+        for level in {level for contender in self.contenders for level in contender.levels()}:
+            groups = [runs for c in self.contenders if (runs := c.at(level))]
+            count = sum(map(len, groups))
+            mean = sum(run.image().astype(float) for runs in groups for run in runs) / count
+            for runs in groups:
+                found = metrics.errors_between_seeds([run.image() for run in runs], mean)
+                for run, errors in zip(runs, found):
+                    run.errors = errors
 
     def _share_session(self, contender: Contender, run: Run) -> None:
         """If a run and the first integrator's run of the same round were never timed in the same
@@ -234,6 +256,8 @@ class Experiment:
             zero_radiance=report.zero_radiance if report else contender._zero_radiance,
             memory=timed.memory or None,
             launches=timed.launches,
+            mean=float(pixels.mean(dtype=float)),
+            learned=report.learned if report else "",
         )
         metadata = {
             "scene": self.scene.source,
@@ -286,11 +310,14 @@ class Experiment:
         for spp in kinds:
             self._timed(contender, 0, spp, seed=0)
         level = self.budget.values[0]
-        contender._plans = self.budget.is_time and timing.plans_for_time(
-            integrator, self.scene.scene
-        )
+        contender._plans = (  # by the wall clock
+            self.budget.is_time and not self._cpu_time
+            and timing.plans_for_time(integrator, self.scene.scene)
+        )  # fmt: skip
         if self.budget.is_time and not contender._plans:
-            spp = timing.samples_for(level, integrator, self.scene.scene, run_seed(0, 0))
+            spp = timing.samples_for(
+                level, integrator, self.scene.scene, run_seed(0, 0), cpu_time=self._cpu_time
+            )
             contender._pace = level / spp
         else:
             timed = self._timed(contender, level, kinds[-1] if kinds else 0, seed=0)
@@ -304,7 +331,7 @@ class Experiment:
         if contender._plans:
             timed = timing.render_for(level, integrator, scene, seed)
         else:
-            timed = timing.timed_render(integrator, scene, seed, spp)
+            timed = timing.timed_render(integrator, scene, seed, spp, cpu_time=self._cpu_time)
         contender.compile_seconds += timed.compile_seconds
         return timed
 

@@ -52,6 +52,7 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
     sensor_count = experiment.sensor_count
     if sensor_count > 1:
         yield f"the scene has {sensor_count} sensors: the first is used"
+    yield from _sessions(experiment)
     if reference is None:
         return
     if reference.variance is None:
@@ -67,7 +68,6 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
     actual = scene.settings.get("max_depth")
     if isinstance(claimed, int) and actual is not None and claimed != actual:
         yield f"the reference has max_depth {claimed}, the scene {actual}"
-    yield from _sessions(experiment)
 
 
 def _sessions(experiment: Experiment) -> Iterator[str]:

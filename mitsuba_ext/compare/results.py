@@ -9,6 +9,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
     command    the command line; null from the API
     state      "finished", or "interrupted": some runs are missing
     budget     kind ("spp", "time", "sweep" or "until"), values
+    errors     "to the reference", or "between seeds": these are variances, which lack bias
+    clock      "wall", or "cpu": seconds are CPU time of all threads
     seeds      runs wanted for each integrator and level
     scenes     a list:
         name, path (null for a scene from a dict), parameters, content_hash, size [width, height],
@@ -16,7 +18,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
         hide_emitters}: what the integrators took over from the scene's own
         error      why the scene could not be measured; empty if it could
         warnings   a list
-        reference  path, noise (its own relMSE), spp, integrator, seconds, metadata; or null
+        reference  path, noise (its own relMSE), spp, integrator, seconds, metadata; null if there
+                   is none
         integrators  a list, in the order of the command line:
             label, name, parameters
             error            why it failed; empty if it did not
@@ -25,21 +28,24 @@ bounds are null for a single one), or null where there is none. Other unknown nu
             compile_seconds  of this session: small where the kernels were compiled before, for
                              another integrator or in an earlier session
             runs             a list: level (samples, or seconds), round, seed, spp, seconds,
-                             relmse, relmse_trimmed, mse, rmse, sigma_mu, flip,
+                             relmse, relmse_trimmed, relmse_worst, mse, rmse, sigma_mu, flip,
+                             mean (of the image), learned (a sentence, or empty),
                              rays {camera, scatter, shadow}, connections, zero_radiance,
                              memory (bytes), launches, session, image, timed_again (seconds of
                              the same render in later sessions, by session)
             levels           a list:
                 level, run_count
                 refused      why the errors are not given: the reference is too noisy for them
-                figures      F of spp, seconds (median), relmse, relmse_trimmed, mse, rmse,
-                             sigma_mu, flip, rays, rays_camera, rays_scatter, rays_shadow,
+                figures      F of spp, seconds (median), relmse, relmse_trimmed, relmse_worst, mse,
+                             rmse, sigma_mu, flip, mean, rays, rays_camera, rays_scatter,
+                             rays_shadow,
                              shadow_share (shadow rays traced / those that path would trace),
                              zero_radiance, memory, launches,
                              efficiency (1 / (mean relMSE · median seconds))
-                ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
-                             integrator at the same level; those of times from rounds in which both
-                             have a time of one session
+                ratios       F of seconds, relmse, relmse_trimmed, relmse_worst, mean, efficiency,
+                             efficiency_trimmed (by the trimmed relMSE), to the first integrator at
+                             the same level; those of times from rounds in which both have a time of
+                             one session
             slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
             target           F of the spp and seconds that the relMSE of "until" costs; else null.
                              (The runs stop at the first level whose mean relMSE is small enough.
@@ -47,13 +53,13 @@ bounds are null for a single one), or null where there is none. Other unknown nu
     versions   mitsuba_ext, mitsuba, drjit, variant, numpy, python
     machine    system, processor, cores
 
-Seconds are wall clock without compilation, learning included.
+Seconds are without compilation, learning included.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +75,9 @@ SCHEMA = 2
 #: Number of levels, the last ones, from which the cost of the error of ``until`` is estimated.
 _FITTED_LEVELS = 4
 
-_ERRORS = ("relmse", "relmse_trimmed", "mse", "rmse", "sigma_mu", "flip")
-_COSTS = ("spp", "ray_count", "shadow_share", "zero_radiance", "memory", "launches")
+_RELATIVE_ERRORS = ("relmse", "relmse_trimmed", "relmse_worst")
+_ERRORS = (*_RELATIVE_ERRORS, "mse", "rmse", "sigma_mu", "flip")
+_OTHERS = ("mean", "spp", "ray_count", "shadow_share", "zero_radiance", "memory", "launches")
 _NAMES = {"ray_count": "rays"}
 _EFFORTS = ("spp", "seconds")
 
@@ -185,33 +192,37 @@ def _level_record(
     own_rounds = {run.round: run for run in runs}
     pairs = [(own_rounds[run.round], run) for run in first if run.round in own_rounds]
 
-    def ratio(name: str) -> Estimate | None:
-        values = [(getattr(own.errors, name), getattr(other.errors, name)) for own, other in pairs]
+    def ratio(name: str, of: Callable[[Run], object] = lambda run: run.errors) -> Estimate | None:
+        values = [(getattr(of(own), name), getattr(of(other), name)) for own, other in pairs]
         return intervals.ratio(figures[name], of_first.get(name), values)
 
-    seconds, efficiency = _timed_ratios(pairs, ratio("relmse"))
+    ratios = {name: ratio(name) for name in _RELATIVE_ERRORS}
+    seconds, efficiency = _timed_ratios(pairs, ratios["relmse"], "relmse")
+    _, trimmed = _timed_ratios(pairs, ratios["relmse_trimmed"], "relmse_trimmed")
     return {
         "level": level,
         "run_count": len(runs),
         "refused": refused,
         "figures": figures,
         "ratios": {
+            **ratios,
+            "mean": ratio("mean", lambda run: run),
             "seconds": seconds,
-            "relmse": ratio("relmse"),
-            "relmse_trimmed": ratio("relmse_trimmed"),
             "efficiency": efficiency,
+            "efficiency_trimmed": trimmed,
         },
     }
 
 
 def _timed_ratios(
-    pairs: Sequence[tuple[Run, Run]], errors: Estimate | None
+    pairs: Sequence[tuple[Run, Run]], errors: Estimate | None, name: str
 ) -> tuple[Estimate | None, Estimate | None]:
     """The ratios of the seconds and of the efficiencies.
 
     Args:
         pairs: Runs of an integrator, and of the first one in the same rounds.
         errors: The ratio of their errors.
+        name: Which errors these are.
     """
     timed = [
         (own, other, _common_times(own, other)) for own, other in pairs
@@ -223,7 +234,7 @@ def _timed_ratios(
     if ratio is None or errors is None or not errors.value > 0:
         return ratio, None
     efficiencies = [
-        (other.errors.relmse * times[1], own.errors.relmse * times[0])
+        (getattr(other.errors, name) * times[1], getattr(own.errors, name) * times[0])
         for own, other, times in timed
     ]
     efficiency = Estimate(1 / (errors.value * ratio.value))
@@ -240,7 +251,7 @@ def _figures(runs: Sequence[Run], is_refused: bool) -> dict[str, Estimate | None
     figures: dict[str, Estimate | None] = {
         "seconds": intervals.median([run.seconds for run in runs])
     }
-    for name in _COSTS:
+    for name in _OTHERS:
         figures[_NAMES.get(name, name)] = _mean([getattr(run, name) for run in runs])
     for kind in ("camera", "scatter", "shadow"):
         figures[f"rays_{kind}"] = _mean([run.rays.get(kind) for run in runs])

@@ -36,17 +36,20 @@ class Run:
         round: Index of the repetition, from 0 on.
         seed: Its seed.
         spp: Samples per pixel that were taken.
-        seconds: Wall clock time of the render, learning included, compilation excluded.
+        seconds: Time of the render, learning included, compilation excluded: wall clock, or CPU
+            time of all threads.
         rays: Rays traced by kind (``camera``, ``scatter``, ``shadow``), empty if not known.
         connections: Connections to lights that were considered (``path`` traces a shadow ray for
             each), ``None`` if not known.
         zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
         memory: Peak of the memory that Dr.Jit held, in bytes.
         launches: Kernels launched.
+        mean: Mean of the image over pixels and channels.
+        learned: What the integrator says that it learned; empty if it says nothing.
         session: The session in which it was measured. Integrators take turns within a session only.
         timed_again: Seconds that the same render took in later sessions, by session.
         path: The EXR that holds the image.
-        errors: Its errors against the reference of the experiment.
+        errors: Its errors against the reference of the experiment, or between seeds.
     """
 
     level: float
@@ -59,6 +62,8 @@ class Run:
     zero_radiance: float | None
     memory: int | None
     launches: int
+    mean: float | None = None
+    learned: str = ""
     session: str = field(default_factory=lambda: marks.SESSION)
     timed_again: dict[str, float] = field(default_factory=dict)
     path: Path = field(default_factory=Path)

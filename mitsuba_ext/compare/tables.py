@@ -16,6 +16,7 @@ from rich.text import Text
 _ERRORS = (
     ("relMSE", "relmse"), ("trimmed", "relmse_trimmed"), ("σ/μ", "sigma_mu"), ("FLIP", "flip"),
 )
+_BETWEEN_SEEDS = (*_ERRORS[:3], ("99 %", "relmse_worst"))
 
 _LEGEND = (
     "Means over the rounds (seconds: medians) with 95 % confidence intervals, given as factors: "
@@ -23,6 +24,12 @@ _LEGEND = (
     "eff. = 1 / (relMSE · seconds), relative to the first integrator; shadow = share of the shadow "
     "rays of 'path' that are traced."
 )
+_LEGEND_BETWEEN_SEEDS = (
+    " Errors are variances between the seeds, without bias: it shows in the mean of the image, "
+    "relative to the first integrator. 99 % = percentile of the errors of pixels; trimmed eff. = "
+    "1 / (trimmed · seconds)."
+)
+_LEGEND_CPU = " Seconds are CPU time of all threads."
 
 #: Width of the output to a file or a pipe.
 _PIPE_WIDTH = 160
@@ -53,7 +60,7 @@ def tables(results: Mapping[str, Any], width: int = _PIPE_WIDTH) -> Iterator[Tab
             continue
         title = _title(scene, results["budget"])
         labels = [contender["label"] for contender in scene["integrators"]]
-        groups = _in_groups(_columns(scene, results["budget"]), labels, width)
+        groups = _in_groups(_columns(scene, results), labels, width)
         for index, columns in enumerate(groups):
             yield Text("" if index else title)
             yield _table(labels, columns, width)
@@ -61,7 +68,12 @@ def tables(results: Mapping[str, Any], width: int = _PIPE_WIDTH) -> Iterator[Tab
             if contender["error"]:
                 yield Text(f"{contender['label']}: {contender['error']}", style="red")
         yield Text("\n".join(_notes(scene)) + "\n")
-    yield Text(_LEGEND)
+    legend = _LEGEND + _LEGEND_BETWEEN_SEEDS * _has_no_reference(results)
+    yield Text(legend + _LEGEND_CPU * (results.get("clock") == "cpu"))
+
+
+def _has_no_reference(results: Mapping[str, Any]) -> bool:
+    return results.get("errors") == "between seeds"
 
 
 class _Column(NamedTuple):
@@ -74,18 +86,24 @@ class _Column(NamedTuple):
         return 2 + max(cell_len(text) for text in (self.heading, *self.cells))
 
 
-def _columns(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> list[_Column]:
+def _columns(scene: Mapping[str, Any], results: Mapping[str, Any]) -> list[_Column]:
     """The figures at the largest level of each integrator."""
+    budget, has_no_reference = results["budget"], _has_no_reference(results)
     makers: dict[str, Callable[[Mapping[str, Any], Mapping[str, Any]], str]] = {
         **{
             heading: lambda _contender, level, name=name: _number(level["figures"][name])
-            for heading, name in _ERRORS
+            for heading, name in (_BETWEEN_SEEDS if has_no_reference else _ERRORS)
         },
         "spp": lambda _contender, level: f"{level['figures']['spp']['value']:.6g}",
         "seconds": lambda _contender, level: _number(level["figures"]["seconds"]),
         "shadow": lambda _contender, level: _percent(level["figures"]["shadow_share"]),
         "eff.": lambda _contender, level: _ratio(level["ratios"]["efficiency"]),
     }
+    if has_no_reference:
+        makers["trimmed eff."] = lambda _contender, level: _ratio(
+            level["ratios"]["efficiency_trimmed"]
+        )
+        makers["mean"] = lambda _contender, level: _ratio(level["ratios"]["mean"])
     if budget["kind"] in ("sweep", "until"):
         makers["slope"] = lambda contender, _level: _difference(contender["slopes"]["spp"])
     if budget["kind"] == "until":
@@ -163,6 +181,8 @@ def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
     for warning in scene["warnings"]:
         yield f"Warning: {warning}."
     for contender in scene["integrators"]:
+        if learned := contender["runs"] and contender["runs"][-1].get("learned"):
+            yield f"{contender['label']} learned in its last run: {learned}."
         for note in contender["notes"]:
             yield f"{contender['label']}: {note}."
         for level in contender["levels"]:

@@ -33,7 +33,8 @@ class Timed(NamedTuple):
     """A render and its cost.
 
     Attributes:
-        seconds: Wall clock time of the whole render, learning and compilation included.
+        seconds: Time of the whole render, learning and compilation included: wall clock, or CPU
+            time of all threads.
         compiled: Was a kernel compiled, or loaded from the disk?
         compile_seconds: Time to compile or load kernels, without tracing.
         launches: Number of kernel launches.
@@ -52,7 +53,12 @@ class Timed(NamedTuple):
 
 
 def timed_render(
-    integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int, sensor: int = 0
+    integrator: mi.Integrator,
+    scene: mi.Scene,
+    seed: int,
+    spp: int,
+    sensor: int = 0,
+    cpu_time: bool = False,
 ) -> Timed:
     """Renders and waits for the image. ``spp`` 0 stands for the number of the scene's sampler.
 
@@ -64,19 +70,20 @@ def timed_render(
 
     check_all_is_seen(integrator, scene)
 
+    clock = time.process_time if cpu_time else time.perf_counter
     # Free garbage now: the collector must not free it while Dr.Jit traces calls (see garbage.py)
     gc.collect()
     dr.detail.malloc_clear_statistics()
     # Recording the kernel history has no measurable cost
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        start = time.perf_counter()
+        start = clock()
         image = integrator.render(
             scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True
         )
         dr.eval(image)
         dr.sync_thread()
-        seconds = time.perf_counter() - start
+        seconds = clock() - start
         kernels = dr.kernel_history([dr.KernelType.JIT])
     forget_state(scene.sensors()[sensor])
     compiled = [kernel for kernel in kernels if not kernel["cache_hit"]]
@@ -137,7 +144,12 @@ def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
 
 
 def samples_for(
-    budget: float, integrator: mi.Integrator, scene: mi.Scene, seed: int, sensor: int = 0
+    budget: float,
+    integrator: mi.Integrator,
+    scene: mi.Scene,
+    seed: int,
+    sensor: int = 0,
+    cpu_time: bool = False,
 ) -> int:
     """How many samples per pixel take ``budget`` seconds.
 
@@ -152,9 +164,10 @@ def samples_for(
     """
 
     def seconds_of(spp: int) -> float:
-        seconds, compiled, *_ = timed_render(integrator, scene, seed, spp, sensor)
+        arguments = integrator, scene, seed, spp, sensor, cpu_time
+        seconds, compiled, *_ = timed_render(*arguments)
         if compiled or seconds < _SHORT:
-            seconds = min(seconds, timed_render(integrator, scene, seed, spp, sensor).seconds)
+            seconds = min(seconds, timed_render(*arguments).seconds)
         return seconds
 
     # Start with 8: with fewer, an integrator may have no pilot pass

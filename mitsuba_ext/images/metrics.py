@@ -14,14 +14,19 @@ reference by the same method with K times the samples of the image raises σ/μ 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from .box_filter import box_means
 from .flip import mean_flip
 
 #: Floor ε of the relative error, as a multiple of the square of the reference's mean.
 RELATIVE_FLOOR = 1e-2
+
+#: The percentile of the relative errors of pixels that stands for the worst ones.
+_WORST = 99
 
 #: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
 TRIMMED_SHARE = 1e-3
@@ -32,12 +37,15 @@ COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
 @dataclass(frozen=True)
 class Errors:
-    """The figures of one image. The first four are means over pixels and channels.
+    """The figures of one image. All but ``relmse_worst``, ``sigma_mu`` and ``flip`` are means over
+    pixels and channels.
 
     Attributes:
         relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
         relmse_trimmed: The same without the 0.1 % of the pixels that have the largest errors. It is
             much smaller than ``relmse`` where a few fireflies make up most of the error.
+        relmse_worst: The 99th percentile of (I−R)² / (R² + ε) over the pixels (means over their
+            channels): how large the errors of the worst pixels are.
         mse: (I−R)².
         rmse: √mse; NaN where the subtraction left no positive ``mse``.
         sigma_mu: σ/μ, the coefficient of variation: the root of the mean squared colour difference,
@@ -49,6 +57,7 @@ class Errors:
 
     relmse: float
     relmse_trimmed: float
+    relmse_worst: float
     mse: float
     rmse: float
     sigma_mu: float
@@ -74,17 +83,59 @@ def errors(
         ValueError: The shapes differ, the reference is black, or a value is not finite.
     """
     squared, weight = _squared_and_weight(image, reference, reference_variance)
-    mse = float(squared.mean())
-    relative = squared * weight
     # Trim the pixels with the largest errors before the variance is subtracted
     seen = (np.asarray(image, np.float64) - reference) ** 2 * weight
+    return _errors(
+        squared, weight, seen.mean(axis=2), _coefficient_of_variation(image, reference),
+        mean_flip(image, reference) if flip else math.nan,
+    )  # fmt: skip
+
+
+def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> list[Errors]:
+    """The figures of images of one integrator that differ in their seeds, without a reference.
+
+    The mean of the n images takes its place. Squared differences from it are multiplied by
+    n / (n − 1): over the images, the mean of their ``relmse`` is then the relative variance between
+    the seeds, which does not contain bias. The trimmed relMSE leaves out the pixels in which this
+    variance is largest. FLIP is unknown, and so are all figures of a single image.
+
+    Args:
+        images: The images.
+        scale: The image whose mean over 9x9 pixels is the R of relative errors. (In the mean of
+            its own pixel, a firefly would reduce its own relative error.)
+    """
+    stack = np.asarray(images, np.float64)
+    count = len(stack)
+    if count < 2 or not np.any(scale):
+        return [Errors(*[math.nan] * len(fields(Errors)))] * count
+    mean, correction = stack.mean(axis=0), count / (count - 1)
+    smooth = np.stack([box_means(channel) for channel in np.moveaxis(scale, 2, 0)], axis=2)
+    weight = _weight(smooth)
+    variance = (stack.var(axis=0, ddof=1) * weight).mean(axis=2)
+    return [
+        _errors(
+            (image - mean) ** 2 * correction, weight, variance,
+            correction**0.5 * _coefficient_of_variation(image, mean), math.nan,
+        )
+        for image in stack
+    ]  # fmt: skip
+
+
+def _errors(
+    squared: np.ndarray, weight: np.ndarray, seen: np.ndarray, sigma_mu: float, flip: float
+) -> Errors:
+    """The figures of an image from its squared errors, and their weights in relative errors. The
+    trimmed relMSE leaves out the pixels that have the largest values of ``seen``."""
+    mse = float(squared.mean())
+    relative = (squared * weight).mean(axis=2)
     return Errors(
         relmse=float(relative.mean()),
-        relmse_trimmed=_trimmed_mean(relative.mean(axis=2), seen.mean(axis=2)),
+        relmse_trimmed=_trimmed_mean(relative, seen),
+        relmse_worst=float(np.percentile(relative, _WORST)),
         mse=mse,
         rmse=float(np.sqrt(mse)) if mse >= 0 else math.nan,
-        sigma_mu=_coefficient_of_variation(image, reference),
-        flip=mean_flip(image, reference) if flip else math.nan,
+        sigma_mu=sigma_mu,
+        flip=flip,
     )
 
 

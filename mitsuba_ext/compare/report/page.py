@@ -141,9 +141,11 @@ def _title(results: Record, labels: list[str]) -> str:
 
 def _facts(results: Record) -> list[tuple[str, str]]:
     versions, machine = results["versions"], results["machine"]
-    cores = machine.get("cores")
+    cores, errors = machine.get("cores"), results.get("errors")
     facts = [
         ("Budget", _budget(results)),
+        ("Errors", "variances between the seeds" if errors == "between seeds" else ""),
+        ("Clock", "CPU time of all threads" if results.get("clock") == "cpu" else ""),
         ("Date", str(results["date"]).replace("T", " ").replace("+00:00", " UTC")),
         ("Command", results["command"] or "(from Python)"),
         ("Machine", ", ".join(

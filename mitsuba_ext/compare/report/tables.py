@@ -131,6 +131,7 @@ def _ratios(integrators: list[Record]) -> list[Column]:
         ratio("time", "seconds", "Less is better"),
         ratio("relMSE", "relmse", "Less is better"),
         ratio("trimmed", "relmse_trimmed", "relMSE without the largest 0.1 %: less is better"),
+        ratio("mean", "mean", "The mean of the image: without bias, it is 1"),
     ]
 
 
@@ -163,6 +164,10 @@ _ERRORS = [
     _figure(
         "trimmed", formats.plain, "relmse_trimmed",
         "relMSE without the 0.1 % of the pixels with the largest errors", "error",
+    ),
+    _figure(
+        "99 %", formats.plain, "relmse_worst", "99th percentile of the relative errors of pixels",
+        "error",
     ),
     _figure("rMSE", formats.plain, "rmse", "√ of the mean squared error", "error"),
     _figure("σ/μ", formats.plain, "sigma_mu", "Coefficient of variation, Cline (4.13)", "error"),

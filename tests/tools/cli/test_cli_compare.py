@@ -86,6 +86,17 @@ def test_the_changes_of_a_scene_are_those_of_all_its_images(
     assert len(list(tmp_path.glob("references/*.exr"))) == 2
 
 
+def test_no_reference_is_needed(run, make_scene, tmp_path):
+    out = tmp_path / "o"
+    command = ["compare", make_scene(), "path", "neepp", "--spp", 4, "--no-reference", "--cpu"]
+    code, printed, _err = run(*command, "--out", out)
+    assert code == 0
+    assert "trimmed eff." in printed and "CPU time" in printed and "learned" in printed
+    results = json.loads((out / "results.json").read_text())
+    assert (results["errors"], results["clock"]) == ("between seeds", "cpu")
+    assert "variances between the seeds" in (out / "report.html").read_text()
+
+
 def test_several_scenes_are_compared_in_turn(run, make_scene, tmp_path):
     nearer = make_scene("nearer.xml", body=SPHERE.replace('z="5"', 'z="4"'))
     out = tmp_path / "results"
@@ -217,6 +228,11 @@ def test_truncated_reference_is_one_line(make_scene, tmp_path, capfd):
         (
             ["scene.xml", "path", "--spp", "1", "--reference-integrator", ""],
             'integrator "": expected NAME',
+        ),
+        (["scene.xml", "path", "--until", "0.1", "--no-reference"], "without a reference"),
+        (
+            ["scene.xml", "path", "--spp", "1", "--no-reference", "--reference-spp", "8"],
+            "exclude each other",
         ),
         (["scene.xml", "neepp:aovs=depth", "--spp", "1"], '"neepp": the parameter "aovs" must be'),
         (["scene.xml", "variance:a=[path", "--spp", "1"], 'found "[" without "]"'),

@@ -54,12 +54,49 @@ def test_error_slope_and_efficiency_of_a_known_noise_are_found(clock, tmp_path):
     assert first["levels"][-1]["ratios"]["efficiency"]["value"] == pytest.approx(1)
 
 
+def test_without_a_reference_the_variance_between_seeds_is_the_error(clock, tmp_path):
+    integrators = {
+        "first": noisy_integrator(clock, sigma=1.0, cost=0.01),
+        "biased": noisy_integrator(clock, sigma=0.5, cost=0.01, mean=0.9),
+    }
+    comparison = compare.Comparison(
+        WHITE, integrators, compare.equal_samples(16), seeds=5, folder=tmp_path,
+        with_reference=False,
+    )  # fmt: skip
+    (scene,) = comparison.run(progress=False)["scenes"]
+    first, biased = (one["levels"][0] for one in scene["integrators"])
+    assert scene["reference"] is None and not (tmp_path / "references").exists()
+    assert first["figures"]["mse"]["value"] == pytest.approx(1 / 16, rel=0.07)
+    for name, gain in (("relmse", 0.25), ("relmse_trimmed", 0.25), ("efficiency_trimmed", 4)):
+        assert biased["ratios"][name]["value"] == pytest.approx(gain, rel=0.07)
+    assert biased["ratios"]["mean"]["value"] == pytest.approx(0.9, rel=0.01)
+    assert first["figures"]["flip"] is None
+
+
+@pytest.mark.parametrize("seeds, budget", [(1, compare.equal_samples(4)), (3, compare.until(0.1))])
+def test_what_needs_a_reference_is_refused_without_one(seeds, budget):
+    with pytest.raises(InputError, match="without a reference"):
+        compare.Comparison(WHITE, ["path"], budget, seeds=seeds, with_reference=False)
+
+
+def test_cpu_time_is_that_of_the_process(variant, tmp_path, monkeypatch):
+    monkeypatch.setattr(timing.time, "process_time", iter(range(0, 1000, 7)).__next__)
+    comparison = compare.Comparison(
+        WHITE, ["path"], compare.equal_samples(4), folder=tmp_path, with_reference=False,
+        cpu_time=True,
+    )  # fmt: skip
+    results = comparison.run(progress=False)
+    (scene,) = results["scenes"]
+    assert [run["seconds"] for run in scene["integrators"][0]["runs"]] == [7, 7, 7]
+    assert results["clock"] == "cpu"
+
+
 @pytest.mark.parametrize("budget", [0.3, 1.0, 2.0, 3.5, 5.0, 30.0])
 def test_a_time_is_used_although_longer_renders_learn_before(monkeypatch, budget):
     def seconds(spp: int) -> float:
         return 0.04 * spp + (3.0 if spp >= 11 else 0.0)
 
-    def render(integrator, scene, seed, spp, sensor):
+    def render(integrator, scene, seed, spp, sensor, cpu_time):
         return timing.Timed(seconds(spp), False, 0.0, 1, spp, 0, None)
 
     monkeypatch.setattr(timing, "timed_render", render)
@@ -148,8 +185,8 @@ def test_each_level_and_round_has_a_seed_of_its_own_which_integrators_share(cloc
 def test_run_that_had_to_compile_is_thrown_away(clock, tmp_path, monkeypatch):
     timed_render, seen = timing.timed_render, set()
 
-    def compiles_once(integrator, scene, seed, spp):
-        timed = timed_render(integrator, scene, seed, spp)
+    def compiles_once(integrator, scene, seed, spp, **named):
+        timed = timed_render(integrator, scene, seed, spp, **named)
         if (seed, spp) in seen:
             return timed
         seen.add((seed, spp))

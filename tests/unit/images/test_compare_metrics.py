@@ -35,7 +35,7 @@ def test_floor_comes_from_the_mean_of_the_reference():
 
 @needs_flip
 def test_equal_images_have_no_error():
-    assert metrics.errors(constant(1), constant(1)) == metrics.Errors(0, 0, 0, 0, 0, 0)
+    assert metrics.errors(constant(1), constant(1)) == metrics.Errors(0, 0, 0, 0, 0, 0, 0)
 
 
 def test_variance_of_the_reference_is_subtracted():
@@ -73,6 +73,20 @@ def test_trimming_drops_exactly_the_largest_thousandth():
     image[7, 8] = 1000  # a third firefly stays
     expected = (1997 * plain + 999**2 / 1.01) / 1998
     assert metrics.errors(image, reference).relmse_trimmed == pytest.approx(expected)
+
+
+def test_errors_between_seeds_are_the_relative_variance():
+    images = np.random.default_rng(3).gamma(4, 0.5, (6, 24, 32, 3))
+    images[2, 5, 7] = 1e4  # the only pixel that is trimmed: 0.1 % of 768
+    scale = np.full((24, 32, 3), 2.0)
+    found = metrics.errors_between_seeds(images, scale)
+    variance = images.var(axis=0, ddof=1) / (4 + 0.04)
+    assert np.mean([e.relmse for e in found]) == pytest.approx(variance.mean())
+    rest = variance[np.arange(24 * 32).reshape(24, 32) != 5 * 32 + 7]
+    assert np.mean([e.relmse_trimmed for e in found]) == pytest.approx(rest.mean())
+    assert all(np.isnan(e.flip) for e in found)
+    (alone,) = metrics.errors_between_seeds(images[:1], scale)
+    assert np.isnan(alone.relmse)
 
 
 def test_one_pixel_is_never_trimmed_away():
