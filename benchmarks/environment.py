@@ -1,7 +1,6 @@
 """Compares ways to sample the light of an environment, at equal samples.
 
     .venv/bin/python benchmarks/environment.py vertex map.hdr
-    .venv/bin/python benchmarks/environment.py images sunny_gloss window
     .venv/bin/python benchmarks/environment.py floor map.hdr
 
 ``vertex`` looks at one vertex with nothing in between, for several materials: σ/μ of what N
@@ -9,10 +8,6 @@ connections bring together, and the exponent with which it falls from N = 4 to 2
 light samples and N/2 BSDF samples (balance heuristic); two-stage sampling divides the map N times,
 as in its source, alone and beside one BSDF sample (power heuristic), as in a render. All have
 randomly shifted Hammersley points.
-
-``images`` renders scenes: error and least CPU time of each integrator relative to ``path``, and the
-efficiency 1 / (error · time); one of them is ``path`` with the sampler ``multijitter``. Errors are
-those of ``benchmarks/equal_samples.py``.
 
 ``floor`` renders the direct light of three_balls with other floors and maps: σ/μ of the pixels that
 show nothing but the floor, with the same number of connections for each method. After Table 5.1 of
@@ -26,18 +21,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from equal_samples import (
-    SCENES,
-    TRIMMED,
-    camera_rays,
-    error,
-    load,
-    options,
-    print_header,
-    print_row,
-    render_in_turns,
-    title,
-)
+from equal_samples import SCENES, camera_rays, print_header, print_row, render_in_turns
 
 import mitsuba_ext  # noqa: F401
 from mitsuba_ext.techniques.two_stage_lights.two_stage import TwoStage
@@ -60,31 +44,8 @@ MATERIALS = {
     "diffuse": {"type": "diffuse"},
 }
 
-INTEGRATORS = {
-    "path": {"type": "path"},
-    "16 connections": {"type": "composed_path", "connections": 16},
-    "resampled": {"type": "composed_path", "next_event": "resampled"},
-    "resampled 32": {
-        "type": "composed_path", "next_event": {"type": "resampled_lights", "candidates": 32},
-    },
-    "portals": {"type": "composed_path", "next_event": "portals"},
-    "two_stage 1": {"type": "two_stage", "light_samples": 1},
-    "two_stage 16": {"type": "two_stage", "light_samples": 16},
-    "triple product 16": {"type": "two_stage", "visibility": "primary"},
-    "half reallocated": {"type": "two_stage", "visibility": "primary", "reallocated": 0.5},
-    "triple product 16, in the world": {
-        "type": "two_stage", "visibility": "world", "splits": 32,
-    },
-    "neepp": {"type": "neepp"},
-    "neepp that goes on": {"type": "neepp", "grid": 16},
-    "learned lights, 16 connections": {
-        "type": "composed_path", "next_event": "contribution", "connections": 16,
-    },
-}  # fmt: skip
-
-#: ``path`` with this sampler is a rival too.
+#: Sampler of the methods that have samples of their own in ``floor``.
 SAMPLER = "multijitter"
-STRATIFIED = f"path, {SAMPLER}"
 
 #: Floors of ``floor``: that of the scene, and metals. A Blinn lobe of roughness 0.1 in pbrt has the
 #: exponent 10, which is about as wide as α = 0.41.
@@ -227,35 +188,6 @@ def vertex(maps: tuple[str, ...]) -> None:
                 slope = np.polyfit(np.log(COUNTS), np.log(values), 1)[0]
                 cells = [*(f"{value:.2g}" for value in values), f"{slope:.2f}"]
                 print_row([f"{Path(file).stem}, {name}", method, *cells])
-
-
-@main.command()
-@options
-@click.option("--trimmed", default=TRIMMED, help="Share of the largest errors that is left out.")
-@click.option("--only", multiple=True, type=click.Choice([*list(INTEGRATORS)[1:], STRATIFIED]),
-              help="These integrators.")  # fmt: skip
-def images(
-    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, trimmed: float,
-    only: tuple[str, ...],
-) -> None:  # fmt: skip
-    """Compares integrators on the scenes NAMES."""
-    others = list(only) or [STRATIFIED, *list(INTEGRATORS)[1:]]
-    print_header(["scene", *(f"{kind}: error | time | efficiency" for kind in others)])
-    chosen = {kind: value for kind, value in INTEGRATORS.items() if kind in ("path", *others)}
-    for name in names:
-        renders = render_in_turns(load(name, size), chosen, max_depth, spp, seeds)
-        if STRATIFIED in others:
-            path = {STRATIFIED: INTEGRATORS["path"]}
-            scene = load(name, size, sampler=SAMPLER)
-            renders |= render_in_turns(scene, path, max_depth, spp, seeds)
-        mean = np.mean([r.mean for r in renders.values()], axis=0)
-        errors = {kind: error(r.variance, mean, trimmed=trimmed) for kind, r in renders.items()}
-        cells = [title(name)]
-        for kind in others:
-            ratio = errors[kind] / errors["path"]
-            slower = min(renders[kind].seconds) / min(renders["path"].seconds)
-            cells.append(f"{ratio:.2f} | {slower:.2f} | {1 / (ratio * slower):.2f}")
-        print_row(cells)
 
 
 def floor_scene(file: str, floor: str, with_balls: bool, size: tuple, sampler: str) -> mi.Scene:

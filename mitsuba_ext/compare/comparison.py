@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Union
 import drjit as dr
 import mitsuba as mi
 
-from ..images import image_files
+from ..images import image_files, metrics
 from ..inputs.scene_changes import UNCHANGED, SceneChanges
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, check_source, load_scene, scene_name
@@ -94,7 +94,7 @@ class Comparison:
 
     Raises:
         InputError: No scene was given, an integrator cannot be made, ``budget`` is no
-            :class:`Budget`, ``seeds`` is below 1 (2 without a reference), ``until`` has no
+            :class:`Budget`, ``seeds`` is below 1 (3 without a reference), ``until`` has no
             reference, the variant is a scalar one, or CPU time is asked for and it is not an LLVM
             one, or the name of the folder is empty.
     """
@@ -129,10 +129,10 @@ class Comparison:
                 f"the budget must be made by equal_samples(64), equal_time(10), sweep([4, 16, 64]) "
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
-        if not with_reference and (budget.target or seeds < 2):
+        if not with_reference and (budget.target or seeds < metrics.MIN_SEEDS):
             raise InputError(
-                "without a reference, errors are the variance between seeds: this needs at least 2 "
-                "seeds, and a budget of samples or time"
+                f"without a reference, errors are the variance between seeds: this needs at least "
+                f"{metrics.MIN_SEEDS} seeds, and a budget of samples or time"
             )
         if cpu_time and not mi.variant().startswith("llvm"):
             raise InputError(f'CPU time needs an LLVM variant, found "{mi.variant()}"')

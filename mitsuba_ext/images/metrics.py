@@ -31,6 +31,9 @@ _WORST = 99
 #: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
 TRIMMED_SHARE = 1e-3
 
+#: Fewest images that :func:`errors_between_seeds` can measure.
+MIN_SEEDS = 3
+
 #: The weights of the channels in a colour difference: their shares of the luminance [Cline 2007].
 COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
@@ -94,10 +97,11 @@ def errors(
 def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> list[Errors]:
     """The figures of images of one integrator that differ in their seeds, without a reference.
 
-    The mean of the n images takes its place. Squared differences from it are multiplied by
-    n / (n − 1): over the images, the mean of their ``relmse`` is then the relative variance between
-    the seeds, which does not contain bias. The trimmed relMSE leaves out the pixels in which this
-    variance is largest. FLIP is unknown, and so are all figures of a single image.
+    In its place is, for each image, the mean of the others, and the variance of this mean is
+    subtracted: (n (I − M)² − V) / (n − 2), if M is the mean of all n images and V their variance.
+    The mean of ``mse`` over the images is thereby that of V, which does not contain bias. The
+    trimmed relMSE leaves out the pixels with the largest V. FLIP is unknown, and so are all figures
+    of fewer than three images.
 
     Args:
         images: The images.
@@ -106,16 +110,17 @@ def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> lis
     """
     stack = np.asarray(images, np.float64)
     count = len(stack)
-    if count < 2 or not np.any(scale):
+    if count < MIN_SEEDS or not np.any(scale):
         return [Errors(*[math.nan] * len(fields(Errors)))] * count
-    mean, correction = stack.mean(axis=0), count / (count - 1)
-    smooth = np.stack([box_means(channel) for channel in np.moveaxis(scale, 2, 0)], axis=2)
-    weight = _weight(smooth)
-    variance = (stack.var(axis=0, ddof=1) * weight).mean(axis=2)
+    mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1)
+    weight = _weight(np.stack([box_means(x) for x in np.moveaxis(scale, 2, 0)], axis=2))
+    seen = (variance * weight).mean(axis=2)
+    # The differences from the mean of all, which contains each image itself, are too small
+    correction = math.sqrt(count / (count - 1))
     return [
         _errors(
-            (image - mean) ** 2 * correction, weight, variance,
-            correction**0.5 * _coefficient_of_variation(image, mean), math.nan,
+            (count * (image - mean) ** 2 - variance) / (count - 2), weight, seen,
+            correction * _coefficient_of_variation(image, mean), math.nan,
         )
         for image in stack
     ]  # fmt: skip

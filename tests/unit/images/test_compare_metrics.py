@@ -85,8 +85,11 @@ def test_errors_between_seeds_are_the_relative_variance():
     rest = variance[np.arange(24 * 32).reshape(24, 32) != 5 * 32 + 7]
     assert np.mean([e.relmse_trimmed for e in found]) == pytest.approx(rest.mean())
     assert all(np.isnan(e.flip) for e in found)
-    (alone,) = metrics.errors_between_seeds(images[:1], scale)
-    assert np.isnan(alone.relmse)
+    # The error of each image against the mean of the others, less the variance of this mean
+    others = np.delete(images, 4, axis=0)
+    own = metrics.errors(images[4], others.mean(axis=0), others.var(axis=0, ddof=1) / 5, flip=False)
+    assert found[4].mse == pytest.approx(own.mse)
+    assert all(np.isnan(e.relmse) for e in metrics.errors_between_seeds(images[:2], scale))
 
 
 def test_one_pixel_is_never_trimmed_away():
