@@ -9,26 +9,15 @@ and the mean over pixels and seeds are given relative to those of uniform sample
 
 from __future__ import annotations
 
-import time
-
 import click
 import numpy as np
-from equal_samples import load, options, print_header, print_row, title
-
-import mitsuba_ext  # noqa: F401
+from equal_samples import load, options, print_header, print_row, render_in_turns, title
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 #: Samples of the reference, in units of those of a render.
 REFERENCE = 16
-
-
-def timed(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int):
-    """The image, and the seconds that it took."""
-    begin = time.perf_counter()
-    image = mi.render(scene, integrator=integrator, spp=spp, seed=seed).numpy()
-    return image.astype(np.float64), time.perf_counter() - begin
 
 
 def errors(images: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -52,23 +41,22 @@ def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tup
     columns = ["95th percentile", "mean", "time"]
     print_header(["scene", *columns, "at equal time: 95th percentile", "mean"])
     path = {"type": "composed_path", "max_depth": max_depth}
-    uniform, adaptive = mi.load_dict(path), mi.load_dict({"type": "adaptive", "nested": path})
     for name in names:
         scene = load(name, size)
-        for integrator in (uniform, adaptive):
-            timed(scene, integrator, spp, 0)
-        renders = [
-            (timed(scene, adaptive, spp, seed), timed(scene, uniform, spp, 1000 + seed))
-            for seed in range(1, seeds + 1)
-        ]
-        slower = min(a[1] for a, _ in renders) / min(b[1] for _, b in renders)
-        more = max(1, round(spp * slower))
-        longer = [timed(scene, uniform, more, 2000 + seed)[0] for seed in range(1, seeds + 1)]
-        parts = [timed(scene, uniform, spp, 3000 + i)[0] for i in range(REFERENCE)]
-        reference = np.mean(parts, axis=0)
-        ours = figures([a[0] for a, _ in renders], reference)
-        equal = ours / figures([b[0] for _, b in renders], reference)
-        in_time = ours / figures(longer, reference)
+        jobs = {"adaptive": (scene, {"type": "adaptive", "nested": path}, spp),
+                "uniform": (scene, path, spp)}  # fmt: skip
+        adaptive, uniform = render_in_turns(jobs, seeds).values()
+        slower = min(adaptive.seconds) / min(uniform.seconds)
+        more = {"": (scene, path, max(1, round(spp * slower)))}
+        longer = render_in_turns(more, seeds)[""]
+        integrator = mi.load_dict(path)
+        reference = np.mean([
+            np.array(mi.render(scene, integrator=integrator, spp=spp, seed=3000 + i))
+            for i in range(REFERENCE)
+        ], axis=0)  # fmt: skip
+        ours = figures(adaptive.images, reference)
+        equal = ours / figures(uniform.images, reference)
+        in_time = ours / figures(longer.images, reference)
         values = [*equal, slower, *in_time]
         print_row([title(name), *(f"{value:.2f}" for value in values)])
         dr.flush_malloc_cache()

@@ -11,16 +11,13 @@ efficiency that follows from both.
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import click
-import numpy as np
-from equal_samples import print_header, print_row
+from equal_samples import print_header, print_row, render_in_turns
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 
-import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 #: Shape, half edges (or radius), and height of the centre above the floor.
@@ -63,20 +60,11 @@ def main(
         kinds: list[dict[str, Any]] = [{"type": "area"}, {"type": emitter}]
         if sampling:
             kinds[1]["sampling"] = sampling
-        scenes = [_scene(kind, *light, sampler, posts, size) for kind in kinds]
-        images, seconds = [[], []], [[], []]
-        for seed in range(seeds + 1):
-            for k, scene in enumerate(scenes):
-                start = time.process_time()
-                image = mi.render(scene, integrator=method, spp=spp, seed=1 + 7919 * seed + k)
-                dr.eval(image)
-                dr.sync_thread()
-                # The first render compiles
-                if seed > 0:
-                    seconds[k].append(time.process_time() - start)
-                    images[k].append(np.array(image, dtype=np.float64))
-        variance = [np.var(x, axis=0, ddof=1).mean() for x in images]
-        gain, slower = variance[0] / variance[1], min(seconds[1]) / min(seconds[0])
+        scenes = {kind["type"]: _scene(kind, *light, sampler, posts, size) for kind in kinds}
+        jobs = {kind: (scene, method, spp) for kind, scene in scenes.items()}
+        area, other = render_in_turns(jobs, seeds).values()
+        gain = area.variance.mean() / other.variance.mean()
+        slower = min(other.seconds) / min(area.seconds)
         print_row([name, f"{gain:.2f}", f"{slower:.2f}", f"{gain / slower:.2f}"])
 
 

@@ -251,12 +251,14 @@ def floor(
         }
         pixels = shows_floor(scenes[SAMPLER])
         for count in counts:
-            values = {}
-            for method, (sampler, integrator, spp) in floor_methods(count).items():
-                made = {method: integrator}
-                renders = render_in_turns(scenes[sampler], made, 2, spp, seeds)[method]
-                variance = renders.variance[pixels].mean()
-                values[method] = float(np.sqrt(variance) / renders.mean[pixels].mean())
+            jobs = {
+                method: (scenes[sampler], {**integrator, "max_depth": 2}, spp)
+                for method, (sampler, integrator, spp) in floor_methods(count).items()
+            }
+            values = {
+                method: float(np.sqrt(r.variance[pixels].mean()) / r.mean[pixels].mean())
+                for method, r in render_in_turns(jobs, seeds).items()
+            }
             least = min(value for method, value in values.items() if "two" in method)
             cells = [*(f"{value:.3f}" for value in values.values())]
             cells.append(f"{least / values['MIS']:.2f}")

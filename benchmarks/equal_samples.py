@@ -1,5 +1,5 @@
-"""What benchmarks share that compare integrators at equal samples: the integrators take turns, and
-errors are the variance between seeds."""
+"""Renders that take turns, and errors that are the variance between seeds, for benchmarks that
+compare more than integrators in one scene (``mitsuba-ext compare --no-reference`` does this)."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ def title(name: str) -> str:
 
 @dataclass
 class Renders:
-    """Renders of one integrator.
+    """Renders of one job.
 
     Attributes:
         images: [seed, height, width, channel].
         seconds: CPU time of each.
-        learned: What each says that it learned (integrators of Mitsuba: nothing).
+        learned: What the integrator said each time that it learned (Mitsuba's: nothing).
     """
 
     images: list[np.ndarray] = field(default_factory=list)
@@ -100,32 +100,26 @@ class Renders:
 
 
 def render_in_turns(
-    scene: mi.Scene,
-    integrators: dict[str, dict | mi.Integrator],
-    max_depth: int | None,
-    spp: int,
-    seeds: int,
+    jobs: dict[str, tuple[mi.Scene, dict | mi.Integrator, int]], seeds: int
 ) -> dict[str, Renders]:
-    """Renders a scene with each integrator (made, or as for ``mi.load_dict``) and so many seeds. A
-    render before, which compiles the kernels, does not count. ``max_depth`` is that of integrators
-    that are not made yet, if they do not say it themselves."""
-    depth = {} if max_depth is None else {"max_depth": max_depth}
+    """Renders each job (scene, integrator, samples per pixel) with ``seeds`` seeds. The first
+    render of each compiles the kernels, and does not count."""
     made = {
-        k: mi.load_dict({**v, **depth}) if isinstance(v, dict) else v
-        for k, v in integrators.items()
+        job: (scene, mi.load_dict(integrator) if isinstance(integrator, dict) else integrator, spp)
+        for job, (scene, integrator, spp) in jobs.items()
     }
-    renders = {kind: Renders() for kind in integrators}
+    renders = {job: Renders() for job in jobs}
     for seed in range(seeds + 1):
-        for kind, integrator in made.items():
+        for job, (scene, integrator, spp) in made.items():
             start = time.process_time()
             image = mi.render(scene, integrator=integrator, seed=1 + 7919 * seed, spp=spp)
-            image = np.array(image, dtype=np.float64)
+            image = np.array(image, dtype=np.float64)[..., :3]
             seconds = time.process_time() - start
             if seed > 0:
-                renders[kind].images.append(image)
-                renders[kind].seconds.append(seconds)
+                renders[job].images.append(image)
+                renders[job].seconds.append(seconds)
                 statistics = getattr(integrator, "statistics", None)
-                renders[kind].learned.append(statistics.learned if statistics else "")
+                renders[job].learned.append(statistics.learned if statistics else "")
     return renders
 
 
@@ -144,7 +138,6 @@ def error(
     variance: np.ndarray,
     image: np.ndarray,
     pixels: np.ndarray | slice = slice(None),
-    trimmed: float = TRIMMED,
 ) -> float:
     """The variance of a pixel, divided by mean² + 0.01 · (mean of the image)², without the largest
     0.1 % of the values, on average over pixels and channels.
@@ -158,13 +151,7 @@ def error(
     """
     scale = np.stack([relative_scale(x) for x in np.moveaxis(image, -1, 0)], axis=-1)
     values = np.sort((variance * scale**2)[pixels].ravel())
-    return float(values[: len(values) - int(np.ceil(trimmed * len(values)))].mean())
-
-
-def percentile(squares: np.ndarray, image: np.ndarray) -> float:
-    """The 99th percentile of the pixels' relative squared errors."""
-    scale = np.stack([relative_scale(x) for x in np.moveaxis(image, -1, 0)], axis=-1)
-    return float(np.percentile((squares * scale**2).mean(axis=-1), 99))
+    return float(values[: len(values) - int(np.ceil(TRIMMED * len(values)))].mean())
 
 
 def print_header(columns: Sequence[str]) -> None:

@@ -39,10 +39,6 @@ import mitsuba as mi  # isort: skip
 COLUMNS = ["scene", "pixels", "share", "unblocked: uniform", "visibility"]
 COLUMNS += ["gain", "time", "efficiency"]
 
-INTEGRATORS = {
-    kind: {"type": "light_tracer", "lens_sampling": kind} for kind in LENS_SAMPLING
-}
-
 #: Regions: how many of a pixel's camera rays meet something near.
 REGIONS = {"all": (0.0, 1.01), "10 to 50 %": (0.1, 0.5), "50 to 90 %": (0.5, 0.9)}
 
@@ -128,7 +124,9 @@ def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tup
         scene = room(ROOMS[name], size) if name in ROOMS else load(name, size)
         share = hidden(scene)
         reached = unblocked(scene, share, max_depth)
-        renders = render_in_turns(scene, INTEGRATORS, max_depth, spp, seeds)
+        tracer = {"type": "light_tracer", "max_depth": max_depth}
+        jobs = {kind: (scene, {**tracer, "lens_sampling": kind}, spp) for kind in LENS_SAMPLING}
+        renders = render_in_turns(jobs, seeds)
         uniform, other = (renders[kind] for kind in LENS_SAMPLING)
         mean, slower = (uniform.mean + other.mean) / 2, other.time / uniform.time
         for region, (low, high) in REGIONS.items():

@@ -56,8 +56,8 @@ def main(names, max_depth, spp, seeds, size, python, kinds, engines) -> None:
     side = size[1]
     for name in names:
         scene = load(name, (side, side))
-        integrators = {kind: {"type": kind} for kind in kinds}
-        renders = render_in_turns(scene, integrators, max_depth, spp, seeds)
+        jobs = {kind: (scene, {"type": kind, "max_depth": max_depth}, spp) for kind in kinds}
+        renders = render_in_turns(jobs, seeds)
         mean = renders["bdpt"].mean
         for engine in engines:
             renders[engine] = _theirs(scene, python, engine, side, max_depth, spp, seeds)

@@ -41,8 +41,8 @@ def main(
     for name in names:
         scene = load(name, size)
         for kind in kinds or INTEGRATORS:
-            made = {str(f): with_sizes(kind, f, max_depth) for f in FACTORS}
-            renders = render_in_turns(scene, made, max_depth, spp, seeds)
+            jobs = {str(f): (scene, with_sizes(kind, f, max_depth), spp) for f in FACTORS}
+            renders = render_in_turns(jobs, seeds)
             mean = np.mean([r.mean for r in renders.values()], axis=0)
             errors = [error(r.variance, mean) for r in renders.values()]
             default = errors[FACTORS.index(1)]

@@ -8,16 +8,14 @@ Mitsuba's samplers (five minutes per scene). It plots the gains to ``docs/figure
 from __future__ import annotations
 
 import itertools
-import re
-import time
 from pathlib import Path
 from typing import Any
 
 import click
 import matplotlib.pyplot as plt
 import numpy as np
+from equal_samples import load, render_in_turns
 
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext.techniques.weighted_points.weighted_sets import WEIGHTS
 from mitsuba_ext.util.pointsets import PATTERNS
 
@@ -29,15 +27,15 @@ FIGURES = ROOT / "docs" / "figures"
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 
-#: Scenes for each technique; those of the papers are skipped if they are missing.
-SCENES: dict[str, dict[str, Path]] = {
+#: Scenes for each technique, with the filters of their films.
+SCENES: dict[str, dict[str, str]] = {
     "direct": {
-        "open": ROOT / "scenes" / "open.xml",
-        **{n: SHARED / n / "scene.xml" for n in ("cornell-box", "kitchen", "living-room")},
+        "open": "open:rfilter=gaussian",
+        **{n: str(SHARED / n / "scene.xml") for n in ("cornell-box", "kitchen", "living-room")},
     },
-    "lens": {"defocus": ROOT / "scenes" / "defocus.xml"},
-    "time": {n: ROOT / "scenes" / f"{n}.xml" for n in ("fast_balls", "fan")},
-    "wavelength": {n: ROOT / "scenes" / f"{n}.xml" for n in ("prism", "flint")},
+    "lens": {"defocus": "defocus:rfilter=gaussian"},
+    "time": {"fast_balls": "fast_balls", "fan": "fan"},
+    "wavelength": {"prism": "prism", "flint": "flint"},
 }
 
 #: Integrators to compare with: only ours render moving shapes and dispersion.
@@ -47,17 +45,7 @@ _DIRECT = [("independent", "none"), ("hammersley", "none"), ("hammersley", "unbi
 
 MAX_DEPTH = {"direct": 2, "lens": 6, "time": 4, "wavelength": 12}
 
-WIDTH, HEIGHT = 160, 90
-
-
-def load(file: Path, sampler: str = "independent") -> mi.Scene:
-    """The scene, in a small size, with another sampler."""
-    text = re.sub(r'<sampler type="\w+"', f'<sampler type="{sampler}"', file.read_text())
-    size = {"resx": WIDTH, "resy": HEIGHT} if SHARED in file.parents else {
-        "width": WIDTH, "height": HEIGHT}  # fmt: skip
-    resolver = mi.file_resolver()
-    resolver.prepend(str(file.parent))
-    return mi.load_string(text, **{k: str(v) for k, v in size.items()})
+SIZE = 160, 90
 
 
 def render(scene: mi.Scene, integrator: dict[str, Any], spp: int, seeds: range) -> np.ndarray:
@@ -102,30 +90,21 @@ def reweighted(kind: str, pattern: str, weights: str, count: int) -> dict[str, A
 
 
 def compare(
-    kind: str, file: Path, count: int, seeds: range, reference: np.ndarray
+    kind: str, scene_name: str, count: int, seeds: int, reference: np.ndarray
 ) -> dict[str, tuple[float, float, float]]:
-    """For each integrator and sampler, relMSE and MSE of the whole image, and the median time
-    without compilation. They take turns."""
+    """For each integrator and sampler, relMSE and MSE of the whole image, and the median CPU time
+    without compilation."""
     path, is_direct = path_of(kind), kind == "direct"
     spp = 4 * count if is_direct else count
-    jobs = {f"path, {name}": (load(file, name), mi.load_dict(path), spp) for name in SAMPLERS}
-    scene = load(file)
+    jobs = {f"path, {name}": (load(scene_name, SIZE, name), path, spp) for name in SAMPLERS}
+    scene = jobs["path, independent"][0]
     # A few patterns are enough for the whole image: light samples are a small part of its error
     for pattern, weights in _DIRECT if is_direct else combinations(kind):
-        integrator = mi.load_dict(reweighted(kind, pattern, weights, count))
+        integrator = reweighted(kind, pattern, weights, count)
         jobs[f"{pattern}, {weights}"] = scene, integrator, 4 if is_direct else count
-    images: dict[str, list[np.ndarray]] = {label: [] for label in jobs}
-    seconds: dict[str, list[float]] = {label: [] for label in jobs}
-    for seed in (10**6, *seeds):
-        for label, (scene, integrator, samples) in jobs.items():
-            begin = time.perf_counter()
-            image = mi.render(scene, integrator=integrator, seed=seed, spp=samples).numpy()
-            if seed in seeds:
-                seconds[label].append(time.perf_counter() - begin)
-                images[label].append(image[..., :3])
     return {
-        label: (*errors(np.array(images[label]), reference), float(np.median(seconds[label])))
-        for label in jobs
+        label: (*errors(np.array(found.images), reference), found.time)
+        for label, found in render_in_turns(jobs, seeds).items()
     }
 
 
@@ -147,13 +126,13 @@ def combinations(kind: str) -> list[tuple[str, str]]:
 def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int) -> None:
     """Compares patterns and weights on the scenes NAMES (all, if none is given)."""
     mi.set_variant("llvm_ad_spectral" if kind == "wavelength" else "llvm_ad_rgb")
-    scenes = {n: f for n, f in SCENES[kind].items() if f.exists() and (not names or n in names)}
+    scenes = {n: file for n, file in SCENES[kind].items() if not names or n in names}
     gains: dict[str, dict[int, dict[str, float]]] = {}
     for name, file in scenes.items():
         spp = 4096 if kind == "direct" else 16384
-        reference = render(load(file), path_of(kind), spp, range(7000, 7001))[0]
+        reference = render(load(file, SIZE), path_of(kind), spp, range(7000, 7001))[0]
         for count in counts:
-            table = compare(kind, file, count, range(seeds), reference)
+            table = compare(kind, file, count, seeds, reference)
             error_0, mse_0, seconds_0 = table["path, independent"]
             click.echo(
                 f"\n{name}, {count} samples: relMSE; relative to path: gain in relMSE and in MSE, "
@@ -166,7 +145,7 @@ def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int)
                 )
             gains.setdefault(name, {})[count] = {k: mse_0 / row[1] for k, row in table.items()}
             if kind == "direct":
-                alone = direct(load(file), count, range(seeds))
+                alone = direct(load(file, SIZE), count, range(seeds))
                 plain = alone["independent", "none"]
                 click.echo(
                     f"{name}, {count} light samples: gain over independent ones in relMSE and MSE, "

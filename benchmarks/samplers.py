@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import click
 import numpy as np
-from equal_samples import Renders, error, load, print_header, print_row, render_in_turns, title
+from equal_samples import error, load, print_header, print_row, render_in_turns, title
 from scipy.ndimage import gaussian_filter
 
 import mitsuba as mi  # isort: skip
@@ -47,33 +47,26 @@ def main(
     print_header(["scene", "samples", *(f"`{kind}`" for kind in kinds), "time"])
     for name in names:
         for count in map(int, spp.split(",")):
-            renders = {
-                kind: _renders(load(name, size, kind), integrator, max_depth, count, seeds)
-                for kind in kinds
-            }
-            for r, _taken in renders.values():
+            method = {"type": integrator, "max_depth": max_depth}
+            scenes = {kind: load(name, size, kind) for kind in kinds}
+            renders = render_in_turns({k: (s, method, count) for k, s in scenes.items()}, seeds)
+            for r in renders.values():
                 r.images = [gaussian_filter(image, (blur, blur, 0)) for image in r.images]
-            mean = np.mean([r.mean for r, _taken in renders.values()], axis=0)
-            first = renders["independent"][0]
-            cells = [
-                f"{error(r.variance, mean) / error(first.variance, mean) * taken / count:.3f}"
-                for r, taken in renders.values()
-            ]
-            times = [
-                f"{r.time / first.time * count / taken:.2f}"
-                for r, taken in list(renders.values())[1:]
-            ]
+            mean = np.mean([r.mean for r in renders.values()], axis=0)
+            errors = {kind: error(r.variance, mean) for kind, r in renders.items()}
+            # Samples taken, in units of those asked for
+            more = {kind: _taken(scene, count) / count for kind, scene in scenes.items()}
+            cells = [f"{errors[k] / errors['independent'] * more[k]:.3f}" for k in kinds]
+            first = renders["independent"].time
+            times = [f"{renders[k].time / first / more[k]:.2f}" for k in kinds[1:]]
             print_row([title(name), str(count), *cells, ", ".join(times)])
 
 
-def _renders(
-    scene: mi.Scene, integrator: str, max_depth: int, spp: int, seeds: int
-) -> tuple[Renders, int]:
-    """Renders, and the samples that they took."""
-    found = render_in_turns(scene, {"": {"type": integrator}}, max_depth, spp, seeds)[""]
+def _taken(scene: mi.Scene, spp: int) -> int:
+    """The samples that the sampler takes."""
     sampler = scene.sensors()[0].sampler()
     sampler.set_sample_count(spp)
-    return found, sampler.sample_count()
+    return sampler.sample_count()
 
 
 if __name__ == "__main__":

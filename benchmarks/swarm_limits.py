@@ -1,28 +1,25 @@
 """Measures one kind of map alone, and what maps that know everything would gain:
 ``.venv/bin/python benchmarks/swarm_limits.py six_balls time_map --depth 2 --spp 16 --edges 1,2,4``.
 
-The gain is σ/μ (root mean squared error over the mean of the image) of plain paths, divided by that
-of ``swarm_path`` with this map only, over four seeds, at equal samples and at equal CPU time. For
-each of ``--edges``, maps for tiles of so many pixels are learned from 512 samples per pixel, saved,
-and used in renders that learn nothing.
+The gain is the standard deviation between four seeds of plain paths, divided by the one of
+``swarm_path`` with this map only, at equal samples and at equal CPU time. For each of ``--edges``,
+maps for tiles of this width in pixels are learned from 512 samples per pixel, saved, and used in
+renders that learn nothing.
 """
 
 from __future__ import annotations
 
 import tempfile
-import time
 from pathlib import Path
 
 import click
-
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
+import numpy as np
+from equal_samples import SCENES, render_in_turns
 
 import mitsuba as mi  # isort: skip
-import numpy as np
 
-SCENES = Path(__file__).parents[1] / "scenes"
 MAPS = ("time_map", "lens_map", "distance_map", "light_map", "lobe_map", "direction_map")
-SEEDS, ORACLE_SPP, REFERENCE_SPP = 4, 512, 4096
+SEEDS, ORACLE_SPP = 4, 512
 
 
 @click.command()
@@ -45,19 +42,9 @@ def main(
         wanted = {name: name in names for name in MAPS}
         return mi.load_dict({"type": "swarm_path", "max_depth": depth, **wanted, **parameters})
 
-    def rendered(integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
-        return np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp))
-
-    reference = rendered(swarm(), 999, REFERENCE_SPP)
-
     def measured(integrator: mi.Integrator) -> tuple[float, float]:
-        errors, times = [], []
-        for seed in range(SEEDS):
-            begin = time.process_time()
-            image = rendered(integrator, 7919 * seed + 1, spp)
-            times.append(time.process_time() - begin)
-            errors.append(np.square(image - reference).mean())
-        return np.sqrt(np.mean(errors)) / reference.mean(), float(np.median(times))
+        found = render_in_turns({"": (scene, integrator, spp)}, SEEDS)[""]
+        return float(np.sqrt(found.variance.mean())), found.time
 
     error, seconds = measured(mi.load_dict({"type": "composed_path", "max_depth": depth}))
 
@@ -79,7 +66,7 @@ def main(
         with tempfile.TemporaryDirectory() as folder:
             path = str(Path(folder) / "maps.npz")
             teacher = swarm(save_learned=path, pilot_spp=ORACLE_SPP, always_use=True)
-            rendered(teacher, 77, 2 * ORACLE_SPP)
+            mi.render(scene, integrator=teacher, seed=77, spp=2 * ORACLE_SPP)
             show(f"known, {edge} pixels", swarm(load_learned=path, always_use=True))
 
 

@@ -14,17 +14,14 @@ Results go to ``out/swarming/WIDTH.json``; ``--plot`` draws those of the given w
 from __future__ import annotations
 
 import json
-import resource
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
 import numpy as np
+from equal_samples import TRIMMED, render_in_turns
+
+import mitsuba as mi  # isort: skip
 
 ROOT = Path(__file__).parents[1]
 OUT, FIGURES = ROOT / "out/swarming", ROOT / "docs/figures"
@@ -77,12 +74,6 @@ CASES = {
 METHODS = ("path", "multijitter", "rival", "map", "all maps")
 
 
-def cpu_seconds() -> float:
-    """Of this process, all threads."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
-
-
 def integrator_of(case: Case, method: str) -> mi.Integrator:
     """The integrator of one of the METHODS."""
     depth = {"max_depth": case.depth}
@@ -99,7 +90,7 @@ def integrator_of(case: Case, method: str) -> mi.Integrator:
 def trimmed(variance: np.ndarray) -> float:
     """The mean without the largest 0.1 %."""
     values = np.sort(variance.ravel())
-    return float(values[: len(values) - len(values) // 1000].mean())
+    return float(values[: len(values) - int(TRIMMED * len(values))].mean())
 
 
 def measure(case: Case, width: int, seeds: int) -> dict[str, dict[str, Any]]:
@@ -111,32 +102,22 @@ def measure(case: Case, width: int, seeds: int) -> dict[str, dict[str, Any]]:
         sampler: mi.load_file(file, sampler=sampler, **size)
         for sampler in ("independent", "multijitter")
     }
-    integrators = {method: integrator_of(case, method) for method in METHODS}
-    images: dict[str, list[np.ndarray]] = {method: [] for method in METHODS}
-    times: dict[str, list[float]] = {method: [] for method in METHODS}
-    for turn in range(seeds + 1):
-        for method, integrator in integrators.items():
-            scene = scenes["multijitter" if method == "multijitter" else "independent"]
-            dr.sync_thread()
-            begin = cpu_seconds()
-            # Seeds far from each other: structured samplers
-            image = mi.render(scene, integrator=integrator, seed=7919 * turn + 1, spp=case.spp)
-            image = np.array(image, np.float64)[..., :3]
-            if turn > 0:  # The first turn compiles
-                times[method].append(cpu_seconds() - begin)
-                images[method].append(image)
-    mean = np.mean([image.mean() for group in images.values() for image in group])
-    results = {}
-    for method in METHODS:
-        variance = np.var(images[method], axis=0, ddof=1)
-        results[method] = {
-            "sigma": float(np.sqrt(variance.mean()) / mean),
-            "trimmed": float(np.sqrt(trimmed(variance)) / mean),
-            "seconds": float(np.median(times[method])),
-            "mean": float(np.mean(images[method]) / mean),
-            "learned": getattr(getattr(integrators[method], "statistics", None), "learned", ""),
+    jobs = {
+        method: (scenes.get(method, scenes["independent"]), integrator_of(case, method), case.spp)
+        for method in METHODS
+    }
+    renders = render_in_turns(jobs, seeds)
+    mean = np.mean([found.mean for found in renders.values()])
+    return {
+        method: {
+            "sigma": float(np.sqrt(found.variance.mean()) / mean),
+            "trimmed": float(np.sqrt(trimmed(found.variance)) / mean),
+            "seconds": found.time,
+            "mean": float(found.mean.mean() / mean),
+            "learned": found.learned[-1],
         }
-    return results
+        for method, found in renders.items()
+    }
 
 
 def gains(results: dict[str, dict[str, Any]], method: str) -> tuple[float, float, float]:
