@@ -3,29 +3,23 @@
     python benchmarks/fog.py                                # all scenes
     python benchmarks/fog.py fog sun --seeds 3 --integrator sppm --integrator auto
 
-Renders each scene with each integrator and with so many seeds, in turns, at equal samples, and
-writes a row of Markdown for each integrator: efficiency in units of the first one (in brackets with
-the largest 0.1 % of the squared errors), squared error and CPU time of a render, the mean of the
-image in units of the reference's, and of ``auto`` what it chose and what it says about photons.
-
-Errors are relative as in ``equal_samples.py``, against a reference in ``out/fog``, which is
-rendered where it is missing. The noise of the reference is subtracted. The time contains all
-learning; the first render of each integrator compiles and does not count.
+Compares integrators at equal samples, as ``mitsuba-ext compare --cpu``, and writes a row of
+Markdown for each: efficiency in units of the first one without the largest 0.1 % of the squared
+errors (in brackets with them), relMSE and CPU time of a render, the mean of the image in units of
+the first one's, and what it learned. Runs and references are kept in ``out/fog``.
 """
 
 from __future__ import annotations
 
 import collections
-import time
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
-from equal_samples import SCENES, TRIMMED, load, print_header, print_row
+from equal_samples import SCENES, print_header, print_row
 from fog_scenes import FOGS
 
-import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
-from mitsuba_ext.planning.pixel_estimates import relative_scale
+from mitsuba_ext import compare
 
 import mitsuba as mi  # isort: skip
 
@@ -35,51 +29,25 @@ FOLDER = Path(__file__).parents[1] / "out" / "fog"
 FILES = ("fog", "volume_caustic")
 SPP = {"fog": 160, "bulb": 146, "dark_room": 146}
 
-#: Samples per pixel of a reference, and how many batches of them there are. Photons render some.
-_REFERENCE_SPP, _BATCHES = {"bulb": 256, "volume_caustic": 512}, 4
+#: Samples per pixel of references, and the scenes in which photons render them.
+_REFERENCE_SPP = {"bulb": 256, "volume_caustic": 512}
 _BY_PHOTONS = ("fog", "volume_caustic", "bulb")
 
 
-def make(kind: str) -> mi.Integrator:
-    return mi.load_dict({"type": kind, "max_depth": 8})
-
-
-def image_of(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), dtype=float)
-
-
-def reference(name: str, scene: mi.Scene, spp: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of so many samples of each pixel, and its variance."""
-    size = "x".join(map(str, scene.sensors()[0].film().crop_size()))
-    file = FOLDER / f"{name}_{size}_{spp}spp.npz"
-    if not file.exists():
-        integrator = make("sppm" if name in _BY_PHOTONS else "composed_path")
-        batches = [
-            image_of(scene, integrator, spp // _BATCHES, 90001 + 101 * k) for k in range(_BATCHES)
-        ]
-        file.parent.mkdir(parents=True, exist_ok=True)
-        variance = np.var(batches, axis=0, ddof=1) / _BATCHES
-        np.savez(file, mean=np.mean(batches, axis=0), variance=variance)
-    stored = np.load(file)
-    return stored["mean"], stored["variance"]
-
-
-def errors(images: list[np.ndarray], mean: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """The relative squared error of a render, without the largest 0.1 % of the values and with
-    them. The noise of the reference is left out as a whole, since those of single pixels are
-    known badly."""
-    scale = np.stack([relative_scale(x) for x in np.moveaxis(mean, -1, 0)], axis=-1) ** 2
-    found = [np.sort(((image - mean) ** 2 * scale).ravel()) for image in images]
-    kept = round((1 - TRIMMED) * mean.size)
-    noise = np.sort((variance * scale).ravel())
-    trimmed = np.mean([x[:kept].mean() for x in found]) - noise[:kept].mean()
-    return float(trimmed), float(np.mean(found) - noise.mean())
-
-
-def chosen(effects: dict[str, dict]) -> str:
-    """What was kept, in a few words."""
-    words = {"light_paths": "photons", "next_event": "lights", "directions": "guide"}
-    return " + ".join(words.get(x, x) for x, effect in effects.items() if effect["is_kept"])
+def cells(integrator: dict[str, Any]) -> list[str]:
+    """Of the row of an integrator."""
+    level = integrator["levels"][-1]
+    figures, ratios = level["figures"], level["ratios"]
+    gain, of_all, mean, error = (
+        f"{found['value']:.3g}" if found else "–"
+        for found in (ratios["efficiency_trimmed"], ratios["efficiency"], ratios["mean"],
+                      figures["relmse"])
+    )  # fmt: skip
+    learned = collections.Counter(run["learned"] for run in integrator["runs"])
+    return [
+        f"{gain} ({of_all})", error, f"{figures['seconds']['value']:.1f}", mean,
+        ", ".join(f"{what} ({count})" for what, count in learned.items() if what),
+    ]  # fmt: skip
 
 
 @click.command()
@@ -95,40 +63,17 @@ def main(
 ) -> None:  # fmt: skip
     """Compares integrators in the scenes of these NAMES (all by default)."""
     mi.set_variant("llvm_ad_rgb")
-    columns = ["scene", "integrator", "efficiency", "error", "seconds", "mean", "chosen", "photons"]
-    print_header(columns)
+    print_header(["scene", "integrator", "efficiency", "relMSE", "seconds", "mean", "learned"])
     for name in names or (*FILES, *FOGS):
-        is_file = (SCENES / f"{name}.xml").exists()
-        scene = load(name, size) if is_file else mi.load_dict(FOGS[name](*size))
-        mean, variance = reference(name, scene, _REFERENCE_SPP.get(name, reference_spp))
-        images, seconds = collections.defaultdict(list), collections.defaultdict(list)
-        choices, photons = collections.defaultdict(list), {}
-        integrators = {kind: make(kind) for kind in kinds}
-        for seed in range(seeds + 1):
-            for kind, integrator in integrators.items():
-                begin = time.process_time()
-                image = image_of(scene, integrator, spp or SPP.get(name, 256), 1 + 7919 * seed)
-                if seed == 0:
-                    continue
-                seconds[kind].append(time.process_time() - begin)
-                images[kind].append(image)
-                if kind == "auto":
-                    choices[kind].append(chosen(integrator.statistics.effects) or "path")
-                    photons[kind] = integrator.statistics.effects.get("light_paths", {})
-        found = {kind: errors(images[kind], mean, variance) for kind in kinds}
-        taken = {kind: float(np.median(seconds[kind])) for kind in kinds}
-        for kind in kinds:
-            gain, gain_of_all = (
-                found[kinds[0]][k] * taken[kinds[0]] / (found[kind][k] * taken[kind])
-                for k in range(2)
-            )
-            counts = collections.Counter(choices[kind])
-            print_row([
-                name, kind, f"{gain:.3g} ({gain_of_all:.3g})", f"{found[kind][0]:.3g}",
-                f"{taken[kind]:.1f}", f"{np.mean(images[kind]) / mean.mean():.4f}",
-                ", ".join(f"{choice} ({count})" for choice, count in counts.items()),
-                ", ".join(f"{key} {x:.3g}" for key, x in photons.get(kind, {}).items()),
-            ])  # fmt: skip
+        source = FOGS[name](*size) if name in FOGS else SCENES / f"{name}.xml"
+        comparison = compare.Comparison(
+            compare.SceneSetup(source, size, changes=compare.SceneChanges(None, "box", 8)),
+            kinds, compare.equal_samples(spp or SPP.get(name, 256)), seeds, FOLDER / name,
+            _REFERENCE_SPP.get(name, reference_spp),
+            "sppm" if name in _BY_PHOTONS else "composed_path", cpu_time=True,
+        )  # fmt: skip
+        for integrator in comparison.run()["scenes"][0]["integrators"]:
+            print_row([name, integrator["label"], *cells(integrator)])
 
 
 if __name__ == "__main__":
