@@ -58,7 +58,7 @@ def main(files: tuple[Path, ...], spp: int, rounds: int) -> None:
             for label, integrator in made.items():
                 mi.render(scene, integrator=integrator, seed=seed, spp=spp)
                 told = integrator.statistics
-                samples = spp - sum(integrator.pilots(scene, scene.sensors()[0], spp))
+                samples = spp - sum(integrator.plan_learning(scene, scene.sensors()[0], spp).pilots)
                 times[label].append((told.seconds - told.learning_seconds) / samples)
         medians = {label: statistics.median(some[1:]) for label, some in times.items()}
         rays = {label: _rays(integrator) for label, integrator in made.items()}

@@ -111,7 +111,7 @@ def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) 
     if not (hasattr(integrator, "pace_stage") and is_independent(view)):
         return False
     spp = _more_than_fit(view)
-    learns = integrator.pilots(scene, view, spp)
+    learns = integrator.plan_learning(scene, view, spp).pilots
     # Sets of samples would be smaller with a timeout
     has_sets = integrator.samples_per_set(spp) > 1
     return bool(learns and not has_sets and integrator.pace_stage(scene, view, spp))
