@@ -18,7 +18,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.techniques.learned_lights import learner as light_map_learner  # isort: skip
+from mitsuba_ext.planning import verdicts  # isort: skip
 
 #: Both learned decisions are kept, whatever they are worth.
 _GUIDED = {"type": "guided_directions", "always_guide": True}
@@ -43,7 +43,7 @@ def _rays(integrator: mi.Integrator) -> float:
 def main(files: tuple[Path, ...], spp: int, rounds: int) -> None:
     """Measures on the scenes FILES."""
     mi.set_variant("llvm_ad_rgb")
-    light_map_learner.is_worth = lambda *_: True
+    verdicts.is_worth = lambda *_: True
     for file in files:
         scene = mi.load_file(str(file))
         sensor = mi.traverse(scene.sensors()[0])

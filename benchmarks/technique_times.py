@@ -36,15 +36,13 @@ _MAX_DEPTH, _SPP = 6, 64
 
 def predicted_times(scene: mi.Scene) -> dict[Candidate, float]:
     """What the trial of a render predicts for each of its candidates."""
-    trials, learn = [], LightPathTrial.learn
-    LightPathTrial.learn = lambda trial, *rest, **more: (
-        trials.append(trial) or learn(trial, *rest, **more)
-    )
+    trials, choose = [], LightPathTrial.choose
+    LightPathTrial.choose = lambda trial, rival: trials.append(trial) or choose(trial, rival)
     try:
         auto = mi.load_dict({"type": "auto", "max_depth": _MAX_DEPTH})
         mi.render(scene, integrator=auto, spp=_SPP)
     finally:
-        LightPathTrial.learn = learn
+        LightPathTrial.choose = choose
     return {c: float(x) for trial in trials for c, x in zip(trial.candidates, trial.costs)}
 
 
