@@ -99,7 +99,7 @@ def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> lis
 
     In its place is, for each image, the mean of the others, and the variance of this mean is
     subtracted: (n (I − M)² − V) / (n − 2), if M is the mean of all n images and V their variance.
-    The mean of ``mse`` over the images is thereby that of V, which does not contain bias. The
+    The mean of ``mse`` over the images is then the mean of V, which does not contain bias. The
     trimmed relMSE leaves out the pixels with the largest V. FLIP is unknown, and so are all figures
     of fewer than three images.
 
