@@ -44,8 +44,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                              efficiency (1 / (mean relMSE · median seconds))
                 ratios       F of seconds, relmse, relmse_trimmed, relmse_worst, mean, efficiency,
                              efficiency_trimmed (by the trimmed relMSE), to the first integrator at
-                             the same level; ratios of times are from rounds in which both have a time
-                             of one session
+                             the same level; ratios of times are from rounds in which both have
+                             a time of one session
             slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
             target           F of the spp and seconds that the relMSE of "until" costs; else null.
                              (The runs stop at the first level whose mean relMSE is small enough.
