@@ -2,9 +2,9 @@
 
 The estimate of a tile is a compromise between its own counts and the counts of the larger tile
 around it, which weigh more the less the two differ beyond chance: an empirical Bayes estimate. It
-proceeds from the largest tiles, whose prior is uniform, to the smallest, and in each tile from the root of
-the tree of cells to its leaves. At a node, with ``h`` the share of the left half among ``n``
-samples, and ``p`` its estimate in the tile around, it is the mean of a beta distribution::
+proceeds from the largest tiles, whose prior is uniform, to the smallest, and in each tile from the
+root of the tree of cells to its leaves. At a node, with ``h`` the share of the left half among
+``n`` samples, and ``p`` its estimate in the tile around, it is the mean of a beta distribution::
 
     (n h + κ p) / (n + κ)
 

@@ -107,7 +107,7 @@ class MapLearner(Learner):
     # ---- For subclasses ----
 
     #: Whether maps are used only after a stage has measured their gain. Where another
-    #: distribution takes a part of the decisions, the gain that is predicted against uniform numbers
+    #: distribution takes a part of the decisions, a gain that is predicted against uniform numbers
     #: means nothing.
     needs_measurement = False
 
