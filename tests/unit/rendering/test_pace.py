@@ -4,6 +4,7 @@ share their kernels."""
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -14,6 +15,7 @@ import pytest
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering.stages import ChangedSchedule, OneStage, Stage
 from mitsuba_ext.util.arrays import add_own, channel_mean
 from tests.support.stage import area, stage
 
@@ -61,6 +63,35 @@ def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
     integrator.render(_scene(), spp=5000)
     assert asked == [5000, 99]
     assert clock.now == pytest.approx(10, rel=0.05)
+
+
+def test_a_wrapper_measures_the_speed_as_its_nested_integrator_does():
+    """Otherwise, its pilots are planned for samples that never come."""
+    inner, scene = _integrator("auto_path"), _scene()
+    outer = mi.load_dict({"type": "adaptive", "nested": inner})
+    own, nested = (x.pace_stage(scene, scene.sensors()[0], 5000) for x in (outer, inner))
+    assert type(own.estimator) is type(nested.estimator)
+
+
+def test_a_schedule_that_changes_another_one_ends_its_learning_and_divides_it() -> None:
+    class Inner(OneStage):
+        ended = 0
+
+        def divide_first_stage(self, pixel_count: int) -> int:
+            return pixel_count // 2
+
+        def end_learning(self) -> None:
+            self.ended += 1
+
+    class Heavier(ChangedSchedule):
+        def changed(self, stage: Stage) -> Stage:
+            return replace(stage, weight=2.0)
+
+    inner = Inner(None)
+    schedule = Heavier(inner)
+    schedule.end_learning()
+    assert schedule.divide_first_stage(8) == 4 and inner.ended == 1
+    assert schedule.next_stage().weight == 2
 
 
 @pytest.mark.parametrize(("timeout", "compiling"), [(1.0, 0.0), (10.0, 0.5)])
