@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import drjit as dr
@@ -64,8 +65,7 @@ class MapLearner(Learner):
 
     Parameters:
         name: Name of the maps in summaries.
-        decision: The decision that draws from the maps: its attribute ``maps`` is set to them, or
-            to ``None`` for uniform numbers.
+        decision: Draws uniform numbers; with the attribute ``maps``, it draws from these.
         width, height: Size of the film in pixels, with its border where that is sampled.
         cells: The cells of a map.
         samples: Samples per pixel of all pilots.
@@ -73,7 +73,7 @@ class MapLearner(Learner):
         always: Use maps also where they do not pay?
 
     Attributes:
-        decision: See above.
+        decision: The decision of the stage, a copy with its maps.
         last_drawn: What :meth:`drawn` was at the end of the last pass. The camera draws the numbers
             of the next pass before the last one is counted.
         total, importance: At the end of a pass: the radiance of each lane, and the factor from it
@@ -176,10 +176,9 @@ class MapLearner(Learner):
             expected = counts.expected_gain(shares.expected_ratio(form).numpy())
         if len(gains) == 0:
             self.gain = expected
-        self.decision.maps = None
+        self._set_maps(None)
         if self._pays(pilot, min(self.gain, expected)):
-            self.decision.maps = CellDensities(self.cells, shares.mass(form))
-            self.decision.tiles = self.tiles
+            self._set_maps(CellDensities(self.cells, shares.mass(form)), self.tiles)
         elif samples >= _ENOUGH_SAMPLES:
             self._vain_stages += 1
             if self._vain_stages >= _VAIN_STAGES:
@@ -202,9 +201,14 @@ class MapLearner(Learner):
 
     def _given_up(self) -> Any:
         """The decision without maps, once there is no hope for them."""
-        self.decision.maps = None
+        self._set_maps(None)
         self.stop()
         return self.decision
+
+    def _set_maps(self, maps: CellDensities | None, tiles: FilmTiles | None = None) -> None:
+        """Makes a decision with other maps; the earlier one stays as it is."""
+        self.decision = copy.copy(self.decision)
+        self.decision.maps, self.decision.tiles = maps, tiles or self.decision.tiles
 
     def _tiles(self, samples: float) -> FilmTiles:
         """The tiles that have maps once each pixel has this number of samples."""
@@ -241,7 +245,7 @@ class MapLearner(Learner):
         is_rising = (rows[:, 1:] >= rows[:, :-1]).all() and (rows[:, -1] > 0).all()
         state.require(bool(is_rising), '"cumulative" is not rising')
         maps.cumulative = from_numpy(mi.UInt32, cumulative)
-        self.decision.maps, self.decision.tiles = maps, tiles
+        self._set_maps(maps, tiles)
         return self.decision
 
     def finish(self) -> None:
