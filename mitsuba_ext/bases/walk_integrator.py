@@ -220,7 +220,7 @@ class WalkIntegrator(StagedIntegrator):
         pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 0
         setting = Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
-            self.timeout > 0, self.name,
+            self.timeout > 0, self.name, techniques=self.slots,
         )  # fmt: skip
         planner = Planner(
             self.slots, setting, samples, self.estimators(scene, sensor, learning),

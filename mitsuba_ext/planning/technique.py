@@ -29,6 +29,7 @@ class Setting:
         is_timed: Whether a timeout can end the render before it has all samples.
         plugin: The integrator's name in errors and warnings.
         slot: The slot for which a decision is made.
+        techniques: What fills the slots of the integrator.
     """
 
     scene: mi.Scene
@@ -41,6 +42,7 @@ class Setting:
     is_timed: bool = False
     plugin: str = ""
     slot: str = ""
+    techniques: Slots = MappingProxyType({})
 
     @property
     def pixel_count(self) -> int:

@@ -128,8 +128,6 @@ class LightMapsChoice(Swarm):
 
     slots, summary = ("light_numbers",), "lights"
 
-    _lights: Technique | None = None
-
     def check_together(self, plugin: str, slots: Slots) -> None:
         lights = slots.get("next_event")
         if lights is not None and lights.pilot_spp:
@@ -138,13 +136,13 @@ class LightMapsChoice(Swarm):
                 f'are not learned, and "next_event" is "{lights.name}", which learns them: leave '
                 f"one of the two out"
             )
-        self._lights = lights
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         return spp > 0 and bool(scene.emitters())
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
-        lights = self._lights.decision(setting) if self._lights else None
+        technique = setting.techniques.get("next_event")
+        lights = technique.decision(setting) if technique else None
         dimension = lights.choice_dimension if lights else 0
         maps = LightMaps(light_cells(setting.scene, dimension))
         return LightNumbersLearner(self.summary, maps, width, height, **self._how(setting))
