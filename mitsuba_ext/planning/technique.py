@@ -4,7 +4,7 @@ decision or learner that they make for one render."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -42,7 +42,7 @@ class Setting:
     is_timed: bool = False
     plugin: str = ""
     slot: str = ""
-    techniques: Slots = MappingProxyType({})
+    techniques: Slots = field(default_factory=dict)
 
     @property
     def pixel_count(self) -> int:
