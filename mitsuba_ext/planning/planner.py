@@ -96,7 +96,7 @@ class Planner(Schedule):
             of_slot = replace(setting, slot=slot)
             decision = technique.decision(of_slot)
             if decision is not None:
-                self._decide(slot, decision)
+                self.decide(**{slot: decision})
             if setting.max_depth > 1:
                 learner = technique.learner(of_slot, self.learners)
                 if learner is not None:
@@ -172,7 +172,7 @@ class Planner(Schedule):
         if self._finished_stages == 0:
             p, n = self._scout.vertices() if self._scout else (mi.Point3f(), mi.Normal3f())
             for slot, learner in self.learners.items():
-                self._decide(slot, learner.start(self._setting.scene, p, n))
+                self.decide(**{slot: learner.start(self._setting.scene, p, n)})
         if self._finished_stages > 0 or self._pilot_count == 0:
             self._learn()
         return self._stage()
@@ -188,7 +188,7 @@ class Planner(Schedule):
     def _learn(self) -> None:
         pilot = Pilot(self._setting.scene, self.is_at_end)
         for slot, learner in self.learners.items():
-            self._decide(slot, learner.learn(pilot))
+            self.decide(**{slot: learner.learn(pilot)})
         if pilot.is_last:
             if self._savers:
                 self._states = {slot: x.state() for slot, x in self.learners.items()}
@@ -196,11 +196,8 @@ class Planner(Schedule):
                 learner.finish()
 
     def decide(self, **decisions: Any) -> None:
-        """Sets decisions of slots that no technique fills."""
+        """Sets decisions of the stages that follow, by slot."""
         self.decisions = replace(self.decisions, **decisions)
-
-    def _decide(self, slot: str, decision: Any | None) -> None:
-        self.decisions = replace(self.decisions, **{slot: decision})
 
     def _stage(self) -> Stage:
         """The stage that comes next, with the decisions of now."""
@@ -247,8 +244,8 @@ class Planner(Schedule):
         if trial.can_be_guided and not self.is_at_end:
             for slot, learner in again.items():
                 self.learners[slot] = learner.beside_light_paths(trial.chosen_time)
-                self._decide(slot, self.learners[slot].start_again())
-        self._decide("light_paths", choice)
+                self.decide(**{slot: self.learners[slot].start_again()})
+        self.decide(light_paths=choice)
         stage = self._checked_stage(self._stage())
         return replace(stage, discards_earlier=trial.chosen_variance < verdicts.FAR_LESS)
 
@@ -260,11 +257,11 @@ class Planner(Schedule):
             return stage if trial.check is None else replace(stage, images=trial.check.images)
         choice, discards = trial.reconsider(self._rival, self._time_alone(), self._margin), False
         if choice is not None and self._take_up_again is not None:
-            self._decide("light_paths", None)
+            self.decide(light_paths=None)
             self._take_up_again()
         elif choice is not None:
             self._leave_out()
-            self._decide("light_paths", choice)
+            self.decide(light_paths=choice)
             discards = trial.chosen_variance < verdicts.FAR_LESS
         return replace(self._stage(), discards_earlier=discards)
 
@@ -305,7 +302,7 @@ class Planner(Schedule):
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self._everyone.items():
             if slot in states:
-                self._decide(slot, learner.restore(self._setting.scene, states[slot]))
+                self.decide(**{slot: learner.restore(self._setting.scene, states[slot])})
         for learner in self.learners.values():
             learner.finish()
         for slot in set(self._everyone) - set(states):  # they decide as ``path``
