@@ -1,1 +1,2 @@
-"""What knows nothing of scenes: arrays, files, errors, parameters, point sets, and sequences."""
+"""Utilities that do not depend on scenes: arrays, files, errors, parameters, point sets, and
+sequences."""

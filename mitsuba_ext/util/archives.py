@@ -1,4 +1,4 @@
-"""Files of named arrays (``.npz``), with a checksum over all that they hold."""
+"""Files of named arrays (``.npz``) with a checksum over their whole contents."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .stored_arrays import DamagedError, Header, StoredArrays
 #: The arrays that :func:`write` adds.
 _FORMAT, _DIGEST = "format", "digest"
 
-#: The most arrays of a file, and the bytes that are read at once.
+#: The maximum number of arrays in a file, and the number of bytes read at once.
 _MOST_ARRAYS, _CHUNK = 1 << 12, 1 << 20
 
 
@@ -32,11 +32,11 @@ def write(
     """Writes or replaces a file.
 
     Args:
-        form: What the file holds, and the version of its format.
-        arrays: The arrays; the names ``format`` and ``digest`` are taken.
+        form: The kind of contents and the version of their format.
+        arrays: The arrays. The names ``format`` and ``digest`` are reserved.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     with replacing(path) as temporary, temporary.open("wb") as file:
         write_to(file, form, arrays, is_compressed)
@@ -45,7 +45,7 @@ def write(
 def write_to(
     file: BinaryIO, form: str, arrays: Mapping[str, np.ndarray], is_compressed: bool = True
 ) -> None:
-    """As :func:`write`, to a file that is open."""
+    """Like :func:`write`, to an open file."""
     arrays = {**arrays, _FORMAT: np.array(form)}
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     digest = hashlib.sha256()
@@ -57,14 +57,14 @@ def write_to(
 
 
 def read(path: Path, form: str, origin: str, remedy: str) -> StoredArrays:
-    """Opens a file that :func:`write` has written, and checks its checksum. It takes little more
-    memory than the file until arrays are taken.
+    """Opens a file that :func:`write` has written, and checks its checksum. Until arrays are taken,
+    it needs little more memory than the file.
 
     Args:
         path: The file, which exists.
         form: As for :func:`write`.
         origin: The beginning of error messages, such as ``"load_map" names "x.npz", which``.
-        remedy: Their end: what the user can do.
+        remedy: The end of error messages, which says what the user can do.
 
     Raises:
         DamagedError: The file is of another kind or version, or damaged.
@@ -88,10 +88,10 @@ def read(path: Path, form: str, origin: str, remedy: str) -> StoredArrays:
 
 def check_target(path: Path, form: str) -> None:
     """Checks, before a render, that :func:`write` can make or replace a file. A scene names its
-    files, and must not replace others of the user's.
+    files, and must not replace the user's other files.
 
     Raises:
-        InputError: It cannot be written, or there is a file of another kind.
+        InputError: The file cannot be written, or a file of another kind exists.
     """
     files.check_target(path)
     if not os.path.lexists(path):
@@ -107,7 +107,7 @@ def check_target(path: Path, form: str) -> None:
 
 
 class _Archive:
-    """The contents of a file, of which the headers of all arrays have been read.
+    """An open archive; the headers of all its arrays have been read.
 
     Attributes:
         headers: The type and the shape of each array.
@@ -129,7 +129,7 @@ class _Archive:
         return str(self.read(_FORMAT))
 
     def is_sound(self) -> bool:
-        """Is the checksum right?"""
+        """Whether the checksum is right."""
         digest = hashlib.sha256()
         for name in sorted(set(self.headers) - {_DIGEST}):
             header = self.headers[name]
@@ -149,7 +149,7 @@ class _Archive:
         return np.frombuffer(values, header.dtype).reshape(header.shape)
 
     def _chunks(self, name: str) -> Iterator[bytes]:
-        """The values of an array, as many as its header says."""
+        """The values of an array; their number must agree with its header."""
         stream, header = self._opened(name)
         left = math.prod(header.shape) * header.dtype.itemsize
         while left > 0:
@@ -162,7 +162,7 @@ class _Archive:
             raise ValueError("the array is longer than its header says")
 
     def _opened(self, name: str) -> tuple[BinaryIO, Header]:
-        """A stream of the values of an array, and its header."""
+        """A stream of an array's values, and its header."""
         stream = self._zip.open(self._members[name])
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("another version of NumPy's format")
@@ -174,13 +174,13 @@ class _Archive:
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:
-    """The contents of a regular file. (Reading from a pipe would wait for its writer.)
+    """The contents of a regular file. (Reading from a pipe would block until its writer writes.)
 
     Args:
-        most: The largest number of bytes that is accepted; ``None`` for any.
+        most: The maximum number of bytes; ``None`` for no limit.
 
     Raises:
-        OSError: It cannot be read, or is no regular file, or too large.
+        OSError: The file cannot be read, is not a regular file, or is too large.
     """
     with open(path, "rb", opener=_open_at_once) as file:
         status = os.fstat(file.fileno())
@@ -192,7 +192,7 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Opens a file; a pipe without waiting for its writer."""
+    """Opens a file; does not wait for the writer of a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 

@@ -1,4 +1,4 @@
-"""Makes and joins arrays of Dr.Jit."""
+"""Makes and joins Dr.Jit arrays."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 
 def from_numpy(kind: type[T], values: Any) -> T:
-    """Copies ``values``, an array of NumPy or something that can be converted to one, to a flat
-    array of Dr.Jit.
+    """Copies ``values``, a NumPy array or something that can be converted to one, to a flat Dr.Jit
+    array.
 
     Dr.Jit itself uses NumPy's memory without a copy, and its kernels depend on whether that memory
-    is aligned. As this varies by chance, every other process, and every other render, would compile
-    kernels of its own.
+    is aligned. Alignment varies by chance, so about half of all processes and renders would compile
+    separate kernels.
 
     Parameters:
         kind: The type of the result, such as ``mi.Float``.
@@ -40,17 +40,18 @@ def channel_mean(value: Any) -> mi.Float:
     """The mean of the channels of a colour or spectrum, for each lane.
 
     ``dr.mean`` computes the same, but divides and multiplies by the number of lanes, which becomes
-    a literal: each length of a pass would compile a kernel of its own.
+    a literal, so each pass length would compile a separate kernel.
     """
     return dr.sum(value) * (1 / len(value))
 
 
 def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = True) -> None:
-    """Adds values to places of an array that belong to one lane each.
+    """Adds values to array elements, each of which belongs to one lane.
 
-    ``dr.scatter_add`` would do the same, but where several lanes may share a place, Dr.Jit keeps a
-    copy of an array of less than a million numbers for each thread. Kernels then contain its size:
-    for arrays with a place for each lane, each length of a pass would compile a kernel of its own.
+    ``dr.scatter_add`` would do the same. But because several lanes could share an element, Dr.Jit
+    gives each thread a copy of any array with fewer than a million numbers, and kernels then
+    contain its size: for arrays with one element per lane, each pass length would compile a
+    separate kernel.
     """
     dr.scatter_add(target, value, index, active, dr.ReduceMode.NoConflicts)
 
@@ -59,7 +60,7 @@ def joined(parts: Sequence[T]) -> T:
     """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
     type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""
     if len(parts) == 1 and dr.depth_v(parts[0]) == 1:
-        # Opaque: with several parts, the result is no literal either
+        # Opaque, because the result is not a literal with several parts either
         dr.make_opaque(parts[0])
         return parts[0]
     widths = [dr.width(part) for part in parts]

@@ -21,9 +21,9 @@ def first_above(
     longest: int,
     reaches: bool = False,
 ) -> mi.UInt32:
-    """The first index of [first, last] whose entry exceeds ``x`` (``reaches``: or equals it);
-    ``last`` if none does. No range has more than ``longest`` entries, which sets the number of
-    steps; the steps have no branches.
+    """The first index of [first, last] whose entry exceeds ``x`` (with ``reaches``, or equals it);
+    ``last`` if none does. ``longest`` is the maximum length of a range, which sets the number of
+    steps. The steps have no branches.
     """
     index = mi.UInt32(first)
     step = 1 << max(0, (longest - 1).bit_length() - 1) if longest > 1 else 0
@@ -49,8 +49,8 @@ def alias_tables(
 
     Args:
         relative: The weights of all entries, in units of the mean of their group; shape [n].
-        first, last: Where the group of each entry begins and ends; shape [n].
-        longest: The largest number of entries of a group.
+        first, last: The indices at which the group of each entry begins and ends; shape [n].
+        longest: The maximum number of entries of a group.
 
     Returns:
         The threshold of each entry, in [0, 1], and the index of its alias, in its group.

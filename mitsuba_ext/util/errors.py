@@ -26,9 +26,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def one_line(error: BaseException | str) -> str:
     """A message of Mitsuba without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
-    breaks. For an error in a plugin that is written in Python, Mitsuba quotes the whole traceback:
-    this keeps only the message at its end. For an error in a traced function, Dr.Jit only says "see
-    above": this is the message of its cause."""
+    breaks. For an error in a plugin that is written in Python, Mitsuba quotes the whole traceback;
+    only the message at its end is kept. For an error in a traced function, Dr.Jit only says "see
+    above"; the message of its cause is returned."""
     while "(see above)" in str(error) and isinstance(error, BaseException):
         cause = error.__cause__ or error.__context__
         if cause is None:

@@ -20,7 +20,7 @@ _HOST = re.sub(r"\W", "_", platform.node())
 
 
 def is_utf8(text: str) -> bool:
-    """Can Mitsuba take the text? (In Python, the name of a file may contain any bytes.)"""
+    """Whether Mitsuba accepts the text. (In Python, a file name may contain any bytes.)"""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:
@@ -63,7 +63,7 @@ def check_target(path: Path) -> None:
     if path.is_dir():
         raise InputError(f"{path}: is a folder")
     check_folder(path.parent)
-    # Where the folder can be written, so could the file be replaced, against its owner's wish
+    # In a writable folder, even a read-only file could be replaced, against its owner's wish
     if path.exists() and not os.access(path, os.W_OK):
         raise InputError(f"{path}: is read-only")
 
@@ -75,7 +75,7 @@ def _is_alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # it is another user's; or it is no number of a process
+    except (OSError, OverflowError):  # another user's process, or not a process id
         pass
     return True
 
@@ -83,8 +83,8 @@ def _is_alive(process: int) -> bool:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yields the path of an empty temporary file to write to (:func:`beside`); the finished file
-    then replaces ``path`` in one step. If ``path`` is a link, the link is replaced, and not its
-    target. After an exception, ``path`` is unchanged.
+    then replaces ``path`` in one step. If ``path`` is a link, the link is replaced, not its target.
+    After an exception, ``path`` is unchanged.
 
     Raises:
         OSError: The file cannot be written; the error names it.
@@ -97,9 +97,9 @@ def replacing(path: Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def beside(path: Path) -> Iterator[Path]:
     """Yields the path of an empty temporary file in the folder of ``path``, which is removed
-    afterwards. Removes temporary files for ``path`` of processes on this machine that were killed
-    while they wrote. Nobody can put a link in the place of the temporary file, because its name
-    cannot be guessed.
+    afterwards. Also removes temporary files for ``path`` left by processes on this machine that
+    were killed while writing. The name of the temporary file cannot be guessed, so nobody can put a
+    link in its place.
 
     Raises:
         OSError: The file cannot be written; the error names it.
@@ -130,6 +130,6 @@ def new_file(path: Path) -> TextIO:
     """Opens a text file that does not exist yet. A link counts as existing.
 
     Raises:
-        OSError: There is such a file, or it cannot be made.
+        OSError: The file exists, or it cannot be made.
     """
     return path.open("x", encoding="utf-8")

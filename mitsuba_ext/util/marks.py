@@ -1,5 +1,5 @@
-"""Mark files in the folder of a comparison: which render is running, in which render a process
-died, and that the folder is in use. They remain when a process dies."""
+"""Mark files in the folder of a comparison. They record which render is running, in which render a
+process died, and that the folder is in use. They remain when a process dies."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from .files import make_folder, new_file
 
 try:
     import fcntl
-except ImportError:  # not on Windows: nothing is locked there
+except ImportError:  # Windows: nothing is locked there
     fcntl = None
 
-#: Suffixes of the mark of an integrator: while one of its runs, or a reference, is being rendered
-#: (the file holds the process id), and after the process died in it (the file holds the reason).
+#: Suffixes of an integrator's mark: while one of its runs or a reference is being rendered (the
+#: file holds the process id), and after the process died during it (the file holds the reason).
 _RUNNING = ".running"
 _CRASHED = ".crashed"
 
 _LOCK = ".lock"
 
-#: The folder of rendered references, beside those of the scenes.
+#: The folder of rendered references, beside the folders of the scenes.
 REFERENCES = "references"
 
 #: Identifies a session. A supervisor passes its identifier on to its workers.
@@ -42,24 +42,24 @@ def readable(label: str) -> str:
 
 
 def mark_of(folder: Path, label: str) -> Path:
-    """The mark of an integrator in the folder of a scene. All its runs share it: a process that
-    died in one of them would probably die in the others, and the file name of a run can differ the
+    """The mark of an integrator in the folder of a scene. All its runs share the mark: a process
+    that died in one run would probably die in the others, and the file name of a run can differ the
     next time."""
     return folder / f"{readable(label)}_{zlib.crc32(label.encode()):08x}{_RUNNING}"
 
 
 def has_crashed(mark: Path) -> bool:
-    """Did an earlier process die in a render of this integrator?"""
+    """Whether an earlier process died in a render of this integrator."""
     return mark.with_suffix(_CRASHED).exists()
 
 
 @contextlib.contextmanager
 def marked(mark: Path) -> Iterator[None]:
-    """Sets a mark during a render. If the process dies, the mark stays, and tells the supervisor in
-    which render that happened (:func:`blame`).
+    """Sets a mark during a render. If the process dies, the mark stays and tells the supervisor in
+    which render it died (:func:`blame`).
 
     Raises:
-        RuntimeError: A process died in a render of this integrator before.
+        RuntimeError: A process has already died in a render of this integrator.
     """
     if has_crashed(mark):
         raise RuntimeError(mark.with_suffix(_CRASHED).read_text(encoding="utf-8", errors="replace"))
@@ -85,7 +85,7 @@ def running(folder: Path, process: int) -> set[Path]:
 
 def begun(folder: Path, process: int) -> set[tuple[Path, int]]:
     """The marks of :func:`running`, each with a number that differs from render to render. Marks of
-    references are left out, as these have no time limit."""
+    references are omitted, because references have no time limit."""
     found = set()
     for mark in running(folder, process):
         if mark.parent.name != REFERENCES:
@@ -101,8 +101,8 @@ def renew(mark: Path) -> None:
 
 
 def blame(folder: Path, process: int, message: str) -> set[Path]:
-    """After ``process`` has died, records ``message`` as the reason for the render that it was in.
-    Returns the marks of that render; an empty set if it was not rendering."""
+    """After ``process`` has died, records ``message`` as the reason in the mark of the render that
+    it was in. Returns the marks of that render; an empty set if it was not rendering."""
     marks = running(folder, process)
     for mark in marks:
         mark.with_suffix(_CRASHED).write_text(message, encoding="utf-8")
@@ -111,8 +111,8 @@ def blame(folder: Path, process: int, message: str) -> set[Path]:
 
 
 def forgive(folder: Path) -> None:
-    """Removes all marks, so that integrators that crashed are tried again. Other files are left
-    alone, whatever their suffix."""
+    """Removes all marks, so that crashed integrators are tried again. Other files are left alone,
+    whatever their suffix."""
     for suffix in (_RUNNING, _CRASHED):
         for mark in folder.glob(f"*/*{suffix}"):
             if re.search(r"_[0-9a-f]{8}$", mark.stem):
@@ -121,7 +121,7 @@ def forgive(folder: Path) -> None:
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Locks ``folder`` against other comparisons, as they would slow each other down
+    """Locks ``folder`` against other comparisons, because they would slow each other down
     (:func:`locked`). Marks of earlier processes are removed. In a worker, this does nothing,
     because its supervisor holds the lock.
 
@@ -139,10 +139,10 @@ def in_use(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks ``folder`` against other processes; makes it if it is missing. The lock ends with the
-    process, in whichever way that ends.
+    process, however the process ends.
 
     Raises:
-        InputError: Another process uses the folder, or it cannot be made or locked.
+        InputError: Another process uses the folder, or the folder cannot be made or locked.
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
@@ -161,11 +161,11 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def written_alone(path: Path) -> Iterator[None]:
-    """Locks ``path``, which a render will write, against other renders: the image of the one that
-    ends later would replace the image of the other. The lock ends with the process.
+    """Locks ``path``, which a render will write, against other renders: the later image would
+    replace the earlier one. The lock ends with the process.
 
     Raises:
-        InputError: Another render will write it.
+        InputError: Another render will write the file.
     """
     mark = path.with_name(f".{path.name}{_LOCK}")
     file = _lock(mark, path, f"{path}: another render writes this file", "file")
@@ -181,9 +181,9 @@ def _lock(path: Path, named: Path, refusal: str, what: str) -> TextIO | None:
     """Makes the file ``path``, and locks it; ``None`` on a system without locks.
 
     Parameters:
-        named: What the message names if the file cannot be written.
-        refusal: Begins the message if another process has locked it.
-        what: What that process uses.
+        named: The file that the message names if ``path`` cannot be written.
+        refusal: The beginning of the message if another process has locked ``path``.
+        what: The kind of thing that process uses: a folder or a file.
     """
     if fcntl is None:
         return None
@@ -193,7 +193,7 @@ def _lock(path: Path, named: Path, refusal: str, what: str) -> TextIO | None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            process = file.read() or "unknown"  # the other process has not written it yet
+            process = file.read() or "unknown"  # the other process has not written its id yet
             file.close()
             raise InputError(
                 f"{refusal} (process {process}): wait for its end, or name another {what}"
@@ -211,20 +211,20 @@ def _lock(path: Path, named: Path, refusal: str, what: str) -> TextIO | None:
         file.flush()
     except OSError as error:
         path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # closing it writes what is left
+        with contextlib.suppress(OSError):  # closing the file writes its buffer
             file.close()
         raise InputError(f"{named}: cannot be written ({error.strerror})") from None
     return file
 
 
 def _opened(path: Path) -> TextIO:
-    """Opens a lock, or makes it.
+    """Opens a lock file, or makes it.
 
     Raises:
-        InputError: It cannot be made, or is no lock but something of the user's.
+        InputError: The file cannot be made, or it is not a lock but a file of the user.
     """
     try:
-        # A link might lead to any file of the user
+        # A link might lead to any file of the user's
         flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         file = os.fdopen(os.open(path, flags, 0o666), "a+", encoding="utf-8", errors="replace")
     except OSError as error:

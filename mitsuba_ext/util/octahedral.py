@@ -1,4 +1,4 @@
-"""Directions as points of a square: the faces of an octahedron, unfolded."""
+"""Directions as points of a square: the unfolded faces of an octahedron."""
 
 from __future__ import annotations
 

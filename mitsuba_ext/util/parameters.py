@@ -11,7 +11,7 @@ from .errors import did_you_mean
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Largest number of samples per pixel: structured samplers cannot count more.
+#: The maximum number of samples per pixel: structured samplers cannot count further.
 MOST_SPP = 2**30
 
 
@@ -24,7 +24,7 @@ def read_parameter(
     maximum: float | None = None,
     choices: Sequence[str] = (),
 ) -> Any:
-    """Reads and checks a parameter of the scene. Its type is that of ``default``.
+    """Reads and checks a parameter of the scene. Its type is the type of ``default``.
 
     Args:
         plugin: Name of the plugin, for error messages.

@@ -1,4 +1,4 @@
-"""Arrays of a file, which are checked as they are read."""
+"""Arrays from a file, checked as they are read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-#: The most bytes of a number.
+#: The maximum size of a number, in bytes.
 _MOST_BYTES = 8
 
 
@@ -16,21 +16,21 @@ class DamagedError(ValueError):
 
 
 class Header(NamedTuple):
-    """The type and the shape of an array, which are known before its values are read."""
+    """The type and the shape of an array, known before its values are read."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
 
 
 class StoredArrays:
-    """Arrays by name. An array is read when :meth:`take` asks for it, and only if it has the type
-    and the shape that the reader expects: a small file cannot fill the memory.
+    """Arrays by name. :meth:`take` reads an array, and only if it has the expected type and shape,
+    so a small file cannot fill the memory.
 
     Parameters:
-        headers: What is known about each array.
-        read: Returns the values of an array.
-        origin: The beginning of error messages: where the arrays come from.
-        remedy: Their end: what the user can do.
+        headers: The type and shape of each array.
+        read: A function that returns the values of an array.
+        origin: The beginning of error messages, which says where the arrays come from.
+        remedy: The end of error messages, which says what the user can do.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class StoredArrays:
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> StoredArrays:
-        """Arrays that are in memory already."""
+        """Arrays that are already in memory."""
         headers = {name: Header(array.dtype, array.shape) for name, array in arrays.items()}
         return cls(headers, arrays.__getitem__, "what was learned", "learn it again")
 
@@ -78,11 +78,11 @@ class StoredArrays:
 
         Args:
             name: Its name.
-            kinds: The kinds of types that it may have (``numpy.dtype.kind``).
+            kinds: The accepted kinds of types (``numpy.dtype.kind``).
             shape: Its shape; ``None`` for an axis of any length.
             least, most: The range of its values. By default, real numbers are finite; infinite
                 bounds allow infinite ones, and both of them NaN.
-            longest: The most numbers that it may have.
+            longest: The maximum number of elements.
 
         Raises:
             DamagedError: There is no such array.

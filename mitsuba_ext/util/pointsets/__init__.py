@@ -5,8 +5,8 @@
 >>> w = voronoi_weights(x, boundary="torus")
 >>> estimate = (w * f(x[:, 0], x[:, 1])).sum()
 
-Source: Guo, PhD thesis, chapter 4 and appendix A. The page of :func:`voronoi_weights` tells which
-weights are unbiased.
+Source: Guo, PhD thesis, chapter 4 and appendix A. The documentation of :func:`voronoi_weights` says
+which weights are unbiased.
 """
 
 from .line import correction, nearest_neighbour_weights, trapezoid_weights, unbiased_weights

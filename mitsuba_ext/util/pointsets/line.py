@@ -72,7 +72,7 @@ def trapezoid_weights(x: npt.ArrayLike) -> tuple[FloatArray, float, float]:
     """The trapezoidal rule through 0, the points, and 1 (Yakowitz et al.).
 
     Returns:
-        The weights of the points, that of f(0), and that of f(1).
+        The weights of the points, the weight of f(0), and the weight of f(1).
     """
     x = checked_points("trapezoid_weights", x)
     low, high = float(x.min()), float(x.max())

@@ -17,10 +17,10 @@ PATTERNS = (
     "poisson_disk",
 )  # fmt: skip
 
-#: Candidates for each further point of a Poisson disk pattern.
+#: The number of candidates for each point of a Poisson disk pattern after the first.
 _CANDIDATES = 32
 
-#: Limit of the work of choosing a lattice: number of products that are evaluated.
+#: The maximum number of products that the search for a lattice evaluates.
 _LATTICE_WORK = 1 << 22
 
 
@@ -32,9 +32,9 @@ def points(
     shift around the torus and by the order of the axes (``lattice``: also by their signs).
 
     - ``independent``: i.i.d. uniform numbers.
-    - ``stratified``: one point in each cell of a grid (jittered). Along each axis but the last, the
-      grid has ⌊N^(1/D)⌋ cells. Along the last axis, the columns are divided such that each cell has
-      one point: if N is no D-th power, some columns, chosen at random, have one cell more.
+    - ``stratified``: one point in each cell of a grid (jittered). Along each axis except the last,
+      the grid has ⌊N^(1/D)⌋ cells. Along the last axis, the columns are divided such that each cell
+      has one point: if N is not a D-th power, some columns, chosen at random, have one cell more.
     - ``latin_hypercube``: one point in each of N slices along each axis.
     - ``halton``: scrambled.
     - ``hammersley``: (i / N, Halton), shifted.
@@ -54,7 +54,7 @@ def points(
         Array of shape (N, D).
 
     Raises:
-        ValueError: There is no such pattern; the count or the dimension is no integer, or below 1.
+        ValueError: The pattern is unknown, or the count or the dimension is not a positive integer.
     """
     if pattern not in PATTERNS:
         raise ValueError(f'points: pattern is "{pattern}", not one of {PATTERNS}')
@@ -120,7 +120,7 @@ def _hammersley(count: int, dimension: int, rng: np.random.Generator) -> FloatAr
 
 def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     with warnings.catch_warnings():
-        # SciPy warns of counts that are no power of two
+        # SciPy warns about counts that are not powers of two
         warnings.simplefilter("ignore", UserWarning)
         return _qmc().Sobol(dimension, scramble=True, seed=rng).random(count)
 
@@ -171,7 +171,7 @@ def _poisson_disk(count: int, dimension: int, rng: np.random.Generator) -> Float
 
 
 def _qmc():
-    # Imported here, because it takes longer to load than the rest of this package
+    # Imported here because it takes longer to load than the rest of this package
     from scipy.stats import qmc
 
     return qmc

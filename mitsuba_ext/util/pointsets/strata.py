@@ -27,8 +27,8 @@ def stratum_weights(
         weigher: Weights of points of a single stratum, scaled to [0, 1].
 
     Raises:
-        ValueError: A stratum has no point, so that its part of the integral would be lost; a point
-            is outside of [0, 1]; or the edges do not ascend from 0 to 1.
+        ValueError: A stratum has no point, so its part of the integral would be lost; a point is
+            outside [0, 1]; or the edges do not ascend from 0 to 1.
     """
     x, edges = checked_points("stratum_weights", x), _checked_edges("stratum_weights", edges)
     weights, counts = _within(x, edges, weigher)
@@ -63,7 +63,8 @@ def piecewise_weights(
 ) -> FloatArray:
     """Weights of independent points of a piecewise constant density, computed in each piece
     separately. A piece may have no point by chance. Its weights are therefore divided by the
-    probability that it has at least one: sums are unbiased if those with ``weigher`` are.
+    probability that it has at least one: sums are unbiased if sums with the weights of ``weigher``
+    are.
 
     Parameters:
         x: Points in [0, 1], of shape (N,).

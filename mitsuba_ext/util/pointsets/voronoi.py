@@ -24,9 +24,9 @@ _BORDER = 1e-7
 #: Points closer than this, by dimension, are treated as equal: Qhull cannot distinguish them.
 _SPACING = {2: 1e-10, 3: 1e-7}
 
-#: Accepted errors of the sum of all cells. The first holds with the images near the domain only (a
-#: missing image causes a larger error), the second with all images (close points cause rounding).
-_TOLERANCE, _MOST = 1e-9, 1e-5
+#: The maximum errors of the sum of all cells: with only the images near the domain (a missing image
+#: causes a larger error), and with all images (close points cause rounding errors).
+_NEAR_TOLERANCE, _FULL_TOLERANCE = 1e-9, 1e-5
 
 
 def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArray:
@@ -84,7 +84,8 @@ def _places(x: FloatArray, boundary: str) -> tuple[FloatArray, npt.NDArray[np.in
 
 def _measures(x: FloatArray, boundary: str) -> FloatArray:
     """Areas or volumes of the cells of points that do not coincide; they add up to one."""
-    for margin, tolerance in ((3 * len(x) ** (-1 / x.shape[1]), _TOLERANCE), (np.inf, _MOST)):
+    near = 3 * len(x) ** (-1 / x.shape[1])
+    for margin, tolerance in ((near, _NEAR_TOLERANCE), (np.inf, _FULL_TOLERANCE)):
         try:
             measures = _cell_measures(x, _images(x, boundary, margin))
         except QhullError:

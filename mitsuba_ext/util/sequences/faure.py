@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import from_numpy
 from .scrambling import fraction, mixed
 
-#: For each number of dimensions, the smallest prime that is not less than it.
+#: For each number of dimensions, the smallest prime that is at least as large.
 _BASES = {2: 2, 4: 5, 6: 7, 8: 11}
 
 

@@ -7,11 +7,11 @@ import mitsuba as mi
 
 from .scrambling import fraction, mixed
 
-#: Bases of the dimensions.
+#: The bases of the dimensions.
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
-#: Largest number of intervals that digits distinguish: the numbers have 24 bits, and the next power
-#: of the largest base still fits into 32 bits.
+#: The maximum number of intervals that digits distinguish: the numbers have 24 bits, and the next
+#: power of the largest base still fits into 32 bits.
 _MOST_INTERVALS = 1 << 24
 
 
@@ -44,7 +44,7 @@ class Halton:
 
 class Hammersley(Halton):
     """The Hammersley set: the first dimension is the index plus a random number in [0, 1), divided
-    by the number of points; the others are those of the Halton sequence.
+    by the number of points; the others are the dimensions of the Halton sequence.
 
     Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, 1960.
     """

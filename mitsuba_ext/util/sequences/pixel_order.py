@@ -1,10 +1,10 @@
-"""The order in which the pixels of a film take points of one sequence, so that the errors of
+"""The order in which pixels take the points of one sequence, chosen such that the errors of
 neighbouring pixels cancel.
 
 A sequence whose aligned ranges of points are well distributed is cut into ranges, one for each
-pixel. The pixels are in Z-order: each square of 2^k x 2^k pixels then also has an aligned range of
-points, so that its mean has less error than with independent pixels. The four quarters of each
-square are in random order, so that there are no repeating patterns.
+pixel. The pixels are in Z-order, so each square of 2^k x 2^k pixels also has an aligned range of
+points, and its mean has less error than with independent pixels. The random order of the four
+quarters of each square avoids repeating patterns.
 
 Source: A. G. M. Ahmed, P. Wonka, *Screen-Space Blue-Noise Diffusion of Monte Carlo Sampling Error
 via Hierarchical Ordering of Pixels*, ACM Transactions on Graphics 39(6), 2020.
@@ -20,8 +20,8 @@ import mitsuba as mi
 
 from .scrambling import mixed
 
-#: Each square of 2^7 x 2^7 pixels has a separate sequence: a point's index has only 32 bits, and
-#: errors of such low frequency are already small.
+#: The maximum number of levels. Each square of 2^7 x 2^7 pixels has a separate sequence: a point's
+#: index has only 32 bits, and errors of lower frequency are already small.
 _MOST_LEVELS = 7
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 def mixed(x: mi.UInt32) -> mi.UInt32:
     """A hash: each bit of the result depends on all bits of ``x``.
 
-    Source: C. Wellons, *Hash Prospector* (the function with the least bias of those of two rounds).
+    Source: C. Wellons, *Hash Prospector* (the two-round function with the least bias).
     """
     x = x ^ (x >> 16)
     x = x * 0x7FEB352D
@@ -22,8 +22,8 @@ def flipped_upwards(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Flips each bit of ``x`` or not, by a hash of the bits below it and of the seed: nested
     uniform scrambling of integers whose bits are reversed.
 
-    Source: S. Laine, T. Karras, *Stratified Sampling for Stochastic Transparency*, EGSR 2011; the
-    constants are those of N. Vegdahl, *Building a Better LK Hash*, 2021.
+    Source: S. Laine, T. Karras, *Stratified Sampling for Stochastic Transparency*, EGSR 2011;
+    constants from N. Vegdahl, *Building a Better LK Hash*, 2021.
     """
     x = x ^ (x * 0x3D20ADEA)
     x = x + seed

@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import from_numpy
 from .scrambling import fraction, mixed, scrambled
 
-#: For each dimension but the first: the inner coefficients of the primitive polynomial, as bits,
+#: For each dimension except the first: the inner coefficients of the primitive polynomial, as bits,
 #: and the first direction numbers (Joe and Kuo).
 JOE_KUO = [
     (0, [1]), (1, [1, 3]), (1, [1, 3, 1]), (2, [1, 1, 1]), (1, [1, 1, 3, 3]), (4, [1, 3, 5, 13]),
