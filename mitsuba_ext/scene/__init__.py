@@ -1,1 +1,1 @@
-"""Facts about a loaded scene: bounds, media, portals, what moves, which integrators are nested."""
+"""Queries about a loaded scene: bounds, media, portals, lights, motion, and nested integrators."""

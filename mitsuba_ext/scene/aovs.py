@@ -1,5 +1,5 @@
-"""Checks lists of arbitrary output variables before Mitsuba's ``aov`` reads them: there, an item
-without a type ends the process (a segmentation fault in 3.9.1)."""
+"""Checks lists of arbitrary output variables before Mitsuba's ``aov`` reads them: an item without a
+type makes Mitsuba 3.9.1 crash (a segmentation fault)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def check_aovs(plugin: str, aovs: str) -> None:
     """Checks a list of output variables, ``name:type,name:type``.
 
     Args:
-        plugin: The plugin whose parameter ``aovs`` it is.
+        plugin: The plugin that has the parameter ``aovs``.
         aovs: The list.
 
     Raises:
-        ValueError: An item is not of this form, or its type is unknown.
+        ValueError: An item does not have this form, or its type is unknown.
     """
     for item in filter(None, re.split("[, ]", aovs)):  # as Mitsuba splits it
         name, _colon, kind = item.partition(":")

@@ -2,7 +2,7 @@
 
 Mitsuba 3.9.1 merges meshes of one material when it loads a scene. The boxes of the merged mesh and
 of the scene then do not contain the merged rectangles (``Mesh::merge`` reads a member that
-rectangles do not fill). The boxes here are those of the vertices.
+rectangles do not fill). The boxes here are computed from the vertices.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ def shape_bounds(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
     if not shape.is_mesh() or shape.vertex_count() == 0:
         return shape.bbox()
     positions = np.array(shape.vertex_positions_buffer())
-    # Each coordinate by itself: along an axis of three, NumPy takes fifteen times as long
+    # Each coordinate separately: a reduction along an axis of length three takes NumPy 15 times as
+    # long
     axes = [positions[axis::3] for axis in range(3)]
     return mi.ScalarBoundingBox3f([x.min() for x in axes], [x.max() for x in axes])

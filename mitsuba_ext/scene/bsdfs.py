@@ -1,5 +1,5 @@
-"""Finds BSDFs in scenes, also where others contain them, and raises errors for those that light
-paths cannot render."""
+"""Finds BSDFs in scenes, including nested ones, and raises errors for BSDFs that light paths cannot
+render."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .movers import all_shapes
 
 def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     """Which BSDFs of ``scene`` are, or contain, one of the ``classes``: a table over Dr.Jit's
-    indices of BSDFs. ``None`` if there is none. The BSDFs of an instance are not accessible: where
-    there is one, all BSDFs in memory are examined."""
+    indices of BSDFs. ``None`` if no BSDF does. The BSDFs of an instance are not accessible: if the
+    scene has an instance, all BSDFs in memory are examined."""
     shapes = all_shapes(scene.shapes())
     bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
     if has_instances(scene):
@@ -31,18 +31,20 @@ def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
 
 
 def is_in_table(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Is ``bsdf`` one of those that :func:`bsdf_table` has found?"""
+    """Whether ``bsdf`` is one of the BSDFs that :func:`bsdf_table` has found."""
     index = dr.reinterpret_array(mi.UInt32, bsdf)
     return dr.gather(mi.Bool, table, index, index < dr.width(table))
 
 
 def has_clear_curves(scene: mi.Scene) -> bool:
-    """Does light pass through a curve, such as one with the BSDF ``hair``?
+    """Whether light passes through a curve, such as one with the BSDF ``hair``.
 
-    No ray hits a curve from inside. A camera path that enters a curve leaves it unseen: its vertex
-    is where it enters. The reverse light path meets the other side of the curve instead.
+    No ray hits a curve from inside. A camera path that enters a curve leaves it without an
+    intersection: its only vertex is the entry point. The reverse light path meets the other side of
+    the curve instead.
 
-    The shapes of an instance are not accessible: where there is one, all in memory are examined."""
+    The shapes of an instance are not accessible: if the scene has an instance, all shapes in memory
+    are examined."""
     F = mi.BSDFFlags
     shapes = list(all_shapes(scene.shapes()))
     if has_instances(scene):
@@ -57,14 +59,14 @@ def has_clear_curves(scene: mi.Scene) -> bool:
 
 
 def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
-    """Raises an error if light passes through a curve. For methods that need light paths to find
-    it.
+    """Raises an error if light passes through a curve. For methods whose light paths must meet the
+    curve.
 
     Parameters:
-        what: The beginning of the message: the plugin.
+        what: The beginning of the message, which names the plugin.
 
     Raises:
-        NotImplementedError: :func:`has_clear_curves`.
+        NotImplementedError: :func:`has_clear_curves` is true.
     """
     if has_clear_curves(scene):
         raise NotImplementedError(
@@ -78,7 +80,7 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
     if bsdf.class_name() in classes:
         return True
 
-    # Defined here, since the base class only exists once a variant is selected
+    # Defined here because the base class exists only once a variant is selected
     class Nested(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()
@@ -93,7 +95,7 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
 
 
 def _all_in_memory(kind: type) -> Iterator[mi.Object]:
-    """The objects to which arrays of pointers, of this ``kind``, may point."""
+    """The objects that arrays of pointers of this ``kind`` can refer to."""
     for index in itertools.count(1):
         try:
             found = dr.reinterpret_array(kind, mi.UInt32(index))[0]

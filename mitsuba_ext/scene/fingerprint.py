@@ -1,4 +1,4 @@
-"""Hashes of scenes and of their parts, which are the same in each process."""
+"""Hashes of scenes and their parts that are the same in every process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 def fingerprint(scene: mi.Scene) -> str:
     """A hash of shapes, materials and lights, without sensors and films."""
-    # Sorted: their order differs from one loading of a scene to the next
+    # Sorted because the order differs each time a scene is loaded
     digests = sorted(digest(part) for part in [*scene.shapes(), *scene.emitters()])
     return hashlib.sha256(b"".join(digests)).hexdigest()
 

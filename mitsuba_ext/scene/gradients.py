@@ -1,4 +1,4 @@
-"""Which gradients are requested: what in a scene is optimized."""
+"""Finds the parts of a scene that are optimized: those whose parameters have gradients."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from .parameter_values import values_of
 
-#: Parameters of shapes and sensors that move what rays hit.
+#: Parameters of shapes and sensors that change where rays hit.
 _GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "x_fov", "principal_point_offset_x",
              "principal_point_offset_y")  # fmt: skip
 
@@ -20,10 +20,10 @@ def refuse_geometry(plugin: str, params: Any) -> None:
     """
     Parameters:
         plugin: Name of the integrator.
-        params: The parameters that ``mi.render`` was given, such as those of ``mi.traverse``.
+        params: The parameters passed to ``mi.render``, such as the result of ``mi.traverse``.
 
     Raises:
-        NotImplementedError: Gradients with respect to the place of something are requested.
+        NotImplementedError: Gradients with respect to geometry are requested.
     """
     if not (isinstance(params, Mapping) or hasattr(params, "items")):
         return
@@ -36,15 +36,15 @@ def refuse_geometry(plugin: str, params: Any) -> None:
 
 
 def has_gradients(*things: mi.Object) -> bool:
-    """Do parameters of a scene, or of a sensor, have gradients?"""
+    """Whether any parameter of a scene or a sensor has a gradient."""
     return any(dr.grad_enabled(value) for each in things for _, value in mi.traverse(each))
 
 
 class Optimized:
-    """Which BSDFs and lights of a scene have parameters with gradients.
+    """The BSDFs and lights of a scene that have parameters with gradients.
 
     Attributes:
-        lights_differ (bool): Are some of the lights optimized, but not all?
+        lights_differ (bool): Whether some, but not all, of the lights are optimized.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -72,8 +72,8 @@ def _is_optimized(thing: Any) -> bool:
 
 
 def _has_optimized_colours(shape: mi.Shape) -> bool:
-    """Has a mesh attributes with gradients, which its BSDF may use?"""
-    # Those of its BSDF and its light have the names of these before a dot
+    """Whether a mesh has attributes with gradients, which its BSDF may use."""
+    # Parameters of its BSDF and its light have a prefix and a dot in their names
     values = values_of(mi.traverse(shape))
     return any("." not in key and dr.grad_enabled(value) for key, value in values)
 
@@ -83,7 +83,7 @@ def _index(pointer: mi.BSDFPtr | mi.EmitterPtr) -> int:
 
 
 def _table(flags: Mapping[int, bool]) -> mi.Float:
-    # An object that is not known, such as one of a shape group, counts as optimized
+    # An unknown object, such as one of a shape group, counts as optimized
     table = np.ones(max(flags, default=0) + 1, np.float32)
     table[[*flags]] = [*flags.values()]
     return mi.Float(table)

@@ -1,4 +1,4 @@
-"""Recognizes a scene later on, without keeping it alive."""
+"""Recognizes a scene later without keeping it alive."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import mitsuba as mi
 
 
 class SceneMark:
-    """Holds an array of a scene: while it is held, no other array has its index.
+    """Holds an array of a scene. While it is held, no other array can get its index.
 
-    Scenes cannot be referenced weakly. An integrator must not hold one: where it is the scene's
-    own, the two would keep each other alive, and Dr.Jit, which looks for arrays in the attributes
-    of both, would never end. (It does not look into objects of classes such as this one.)
+    Scenes cannot be referenced weakly. An integrator must not hold a scene: if it is the scene's
+    own integrator, the two would keep each other alive, and Dr.Jit, which searches the attributes
+    of both for arrays, would never finish. (It does not look into objects of classes such as this
+    one.)
 
     Attributes:
         index: Identifies the scene; 0 if it has neither shapes nor lights.
@@ -22,5 +23,5 @@ class SceneMark:
         self.index = 0 if self.array is None else self.array.index
 
     def is_of(self, scene: mi.Scene) -> bool:
-        """Is it the mark of this scene?"""
+        """Whether this is the mark of ``scene``."""
         return self.index > 0 and self.index == SceneMark(scene).index

@@ -14,8 +14,8 @@ from .movers import all_shapes, movers
 
 
 def has_media(scene: mi.Scene) -> bool:
-    """Does any sensor or shape of ``scene`` border on a medium? Media within instances cannot be
-    found: they count for :func:`may_have_media` only."""
+    """Whether any sensor or shape of ``scene`` borders on a medium. Media within instances cannot
+    be found; only :func:`may_have_media` takes them into account."""
     return any(True for _ in _media(scene))
 
 
@@ -27,24 +27,24 @@ def may_have_media(scene: mi.Scene) -> bool:
 
 
 def has_instances(scene: mi.Scene) -> bool:
-    """Are there instances in ``scene``? What they contain cannot be found."""
+    """Whether ``scene`` has instances, whose contents are not accessible."""
     return any(shape.class_name() == "Instance" for shape in all_shapes(scene.shapes()))
 
 
 def may_have_grids(scene: mi.Scene) -> bool:
-    """May there be a medium in ``scene`` that is not homogeneous?"""
+    """Whether ``scene`` may have a medium that is not homogeneous."""
     return has_instances(scene) or any(not medium.is_homogeneous() for medium in _media(scene))
 
 
 def has_homogeneous_media(scene: mi.Scene) -> bool:
-    """Is there a homogeneous medium in ``scene``, outside of instances?"""
+    """Whether ``scene`` has a homogeneous medium outside instances."""
     return any(medium.is_homogeneous() for medium in _media(scene))
 
 
 def extinction_varies(scene: mi.Scene) -> bool:
-    """Has a medium of ``scene``, outside of instances, another extinction in one colour (or
-    wavelength) than in another? Compares them at random points."""
-    # By identity, with the medium itself, so that it stays the same object
+    """Whether the extinction of any medium of ``scene`` outside instances varies between colours
+    (or wavelengths). Compares them at random points."""
+    # By identity, along with the medium itself, so that it stays the same object
     found: dict[int, tuple[mi.Medium, mi.ScalarBoundingBox3f]] = {}
     everything = scene_bounds(scene)
     places = [(sensor.get_medium(), everything) for sensor in scene.sensors()]
@@ -63,7 +63,7 @@ def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
 
     Parameters:
         what: The beginning of the message: the plugin or parameter that does not support media.
-        instead: The end of the message: what to do.
+        instead: The end of the message, which says what to do.
 
     Raises:
         NotImplementedError: There are media in ``scene``.
@@ -119,7 +119,7 @@ def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
     yield from _of_shapes(scene.shapes())
 
 
-#: At how many points, and wavelengths, the extinction of a medium is examined.
+#: The number of points and wavelengths at which the extinction of a medium is examined.
 _PROBES = 1024
 
 
@@ -143,13 +143,13 @@ def _of_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Medium]:
                     yield medium
 
 
-#: How many of Dr.Jit's indices of media are examined.
-_NUMBERS = 1024
+#: The number of Dr.Jit's indices of media that are examined.
+_INDICES = 1024
 
 
 def _any_is_alive() -> bool:
-    """Is there any medium in memory? Dr.Jit gives media indices from 1 on. Every medium has a phase
+    """Whether any medium is in memory. Dr.Jit numbers media from 1 on. Every medium has a phase
     function, and calls with unused indices return zero."""
-    number = dr.opaque(mi.UInt32, 1) + dr.arange(mi.UInt32, _NUMBERS)
+    number = dr.opaque(mi.UInt32, 1) + dr.arange(mi.UInt32, _INDICES)
     phase = dr.reinterpret_array(mi.MediumPtr, number).phase_function()
     return bool(dr.any(phase != None))  # noqa: E711

@@ -1,4 +1,4 @@
-"""Finds the moving parts of a scene, and raises errors for what does not support motion."""
+"""Finds the moving parts of a scene, and raises errors for features that do not support motion."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ def movers(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def all_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
-    """The shapes, and the shapes of which moving ones consist."""
+    """The shapes, followed by the shapes inside moving ones."""
     for shape in shapes:
         yield shape
         yield from all_shapes(getattr(shape, "children", ()))
 
 
 def is_moving_light(emitter: mi.Emitter) -> bool:
-    """Is it a light that moves? Such a light has a ``nested`` emitter at rest, and a ``motion``."""
+    """Whether the emitter is a moving light, which has a ``nested`` emitter at rest and a
+    ``motion``."""
     return isinstance(getattr(emitter, "motion", None), Motion)
 
 
 def is_moving_camera(sensor: mi.Sensor) -> bool:
-    """Is it a ``moving_camera``? That has a ``nested`` sensor, a ``motion`` and ``poses``."""
+    """Whether the sensor is a ``moving_camera``, which has a ``nested`` sensor, a ``motion`` and
+    ``poses``."""
     return isinstance(getattr(sensor, "motion", None), Motion)
 
 
@@ -39,14 +41,14 @@ def sensor_at_rest(sensor: mi.Sensor) -> mi.Sensor:
 
 
 def point_at_rest(sensor: mi.Sensor, p: mi.Point3f, time: mi.Float) -> mi.Point3f:
-    """Transforms a point from world space at ``time`` to where :func:`sensor_at_rest` sees it."""
+    """Transforms a point from world space at ``time`` to the space of :func:`sensor_at_rest`."""
     if not is_moving_camera(sensor):
         return p
     return sensor.poses.pose(mi.UInt32(0), time).point_to_rest(p)
 
 
 def viewing_axis(sensor: mi.Sensor, time: mi.Float) -> mi.Vector3f:
-    """The unit vector in which a sensor looks at a time."""
+    """The unit vector along which a sensor looks at a time."""
     to_world = mi.Transform4f(sensor_at_rest(sensor).world_transform())
     axis = dr.normalize(to_world @ mi.Vector3f(0, 0, 1))
     if not is_moving_camera(sensor):
@@ -59,7 +61,7 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
 
     Parameters:
         what: The beginning of the message: the plugin or parameter that does not support motion.
-        instead: The end of the message: what to do.
+        instead: The end of the message, which says what to do.
 
     Raises:
         NotImplementedError: Something moves in ``scene``.
@@ -71,7 +73,7 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
 
 
 def refuse_moving_lights(scene: mi.Scene) -> None:
-    """Raises an error if a light moves. For methods that start paths from lights.
+    """Raises an error if a light moves; for methods that start paths from lights.
 
     Raises:
         NotImplementedError: A light of ``scene`` moves.

@@ -1,5 +1,5 @@
 """Finds small transparent objects with another surface close behind theirs. Rays start at an offset
-from the surface that they leave: there, they would start behind both.
+from the surface that they leave, and would there start behind both surfaces.
 """
 
 from __future__ import annotations
@@ -12,39 +12,40 @@ import numpy as np
 
 from ..util.arrays import from_numpy
 
-#: Objects count as small if they are smaller than this many offsets.
-_SMALL = 1000
+#: The maximum size of a small object, in offsets.
+_MAX_SIZE = 1000
 
-#: Lines through the box of each object; surfaces that are looked at on each line; and the share of
-#: lines that must meet two close ones. Near an edge of an object, any two of its faces are close.
-_LINES, _SURFACES, _SHARE = 64, 4, 1 / 4
+#: The number of lines through the box of each object, the number of surfaces examined on each line,
+#: and the fraction of lines that must meet two close surfaces. Near an edge of an object, any two
+#: of its faces are close.
+_LINES, _SURFACES, _MIN_FRACTION = 64, 4, 1 / 4
 
-#: The distance of close surfaces, in offsets, on a line that crosses them at an angle.
-_NEAR = 1.5
+#: The maximum distance of close surfaces, in offsets, along a line that crosses them at an angle.
+_MAX_DISTANCE = 1.5
 
-#: The most objects that are examined, evenly spread over the list of shapes.
-_MOST = 256
+#: The maximum number of objects examined, evenly spread over the list of shapes.
+_MAX_OBJECTS = 256
 
-#: What is a small part of an offset.
+#: The step past a surface, as a fraction of an offset.
 _STEP = 1 / 32
 
 #: Shapes whose intersections are exact up to a few rounding errors, besides meshes.
-_EXACT = ("Sphere", "Disk", "Rectangle")
+_EXACT_SHAPES = ("Sphere", "Disk", "Rectangle")
 
 
 def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool:
-    """Is another surface closer to a small transparent object of ``scene`` than the offset
-    of rays? It is false, too, where intersections are not exact enough for a smaller offset: on a
-    GPU, and where there are shapes other than meshes, spheres, disks and rectangles. Meshes that
-    Mitsuba has merged count as one object.
+    """Whether another surface is closer to a small transparent object of ``scene`` than the offset
+    of rays. Also false if intersections are not exact enough for a smaller offset: on a GPU, and if
+    there are shapes other than meshes, spheres, disks and rectangles. Meshes that Mitsuba has
+    merged count as one object.
 
     Parameters:
-        offset: The offset of rays at points whose largest coordinate is given.
+        offset: A function of a point's largest coordinate that returns the offset of rays there.
     """
     shapes = scene.shapes()
     if "llvm" not in mi.variant():
         return False
-    if not all(shape.is_mesh() or shape.class_name() in _EXACT for shape in shapes):
+    if not all(shape.is_mesh() or shape.class_name() in _EXACT_SHAPES for shape in shapes):
         return False
     small = []
     for shape in shapes:
@@ -52,21 +53,21 @@ def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool
         if shape.is_emitter() or not box.valid() or not _lets_through(shape):
             continue
         distance = offset(float(np.abs([box.min, box.max]).max()))
-        if 0 < max(box.extents()) < _SMALL * distance:
+        if 0 < max(box.extents()) < _MAX_SIZE * distance:
             small.append((*box.min, *box.max, distance))
-    small = small[:: -(-len(small) // _MOST) or 1]
+    small = small[:: -(-len(small) // _MAX_OBJECTS) or 1]
     return bool(small) and _are_near(scene, np.array(small, dtype=np.float32))
 
 
 def _lets_through(shape: mi.Shape) -> bool:
-    """May rays pass through the surface of ``shape``?"""
+    """Whether rays may pass through the surface of ``shape``."""
     passes, bsdf = int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null), shape.bsdf()
     return bsdf is not None and int(bsdf.flags()) & passes != 0
 
 
 def _are_near(scene: mi.Scene, small: np.ndarray) -> bool:
-    """Do lines through one of these boxes meet surfaces close to each other? A row has both corners
-    of a box, and the offset there."""
+    """Whether lines through any of these boxes meet surfaces that are close together. A row has the
+    two corners of a box and the offset there."""
     numbers = np.random.default_rng(1)
     rows = np.repeat(small, _LINES, axis=0)
     low, high, offset = rows[:, :3], rows[:, 3:6], rows[:, 6]
@@ -83,9 +84,9 @@ def _are_near(scene: mi.Scene, small: np.ndarray) -> bool:
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=going)
         going &= pi.is_valid()
         if index > 0:
-            # What is not farther than a step may be the same surface
-            near |= going & (pi.t > step) & (pi.t < _NEAR * offset)
+            # A hit within a step may be on the same surface
+            near |= going & (pi.t > step) & (pi.t < _MAX_DISTANCE * offset)
         ray.o = ray(dr.select(going, pi.t + step, 0))
         dr.eval(ray, near, going)
     share = np.array(near).reshape(-1, _LINES).mean(axis=1)
-    return bool(share.max() >= _SHARE)
+    return bool(share.max() >= _MIN_FRACTION)

@@ -1,4 +1,4 @@
-"""Integrators, whether of this package or of Mitsuba: what is nested in them, and their classes."""
+"""Nested integrators and class names of integrators, both of this package and of Mitsuba."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mitsuba as mi
 
 
 def with_nested(integrator: mi.Integrator) -> list[mi.Integrator]:
-    """An integrator, and those that are nested in it at any depth."""
+    """An integrator, and the integrators nested in it at any depth."""
     found = [integrator]
     for child in _children(integrator):
         found += with_nested(child)
@@ -14,9 +14,9 @@ def with_nested(integrator: mi.Integrator) -> list[mi.Integrator]:
 
 
 def class_name(integrator: mi.Integrator) -> str:
-    """The name of the integrator's class, whether that is written in Python or in C++."""
+    """The name of the integrator's class, which may be written in Python or in C++."""
     name, python_class = integrator.class_name(), type(integrator)
-    # Mitsuba does not know classes in Python: it gives the name of the base class in C++
+    # Mitsuba does not know Python classes: it returns the name of the C++ base class
     is_python = name in {base.__name__ for base in python_class.__mro__}
     return python_class.__name__ if is_python else name
 
@@ -41,7 +41,7 @@ def _children(integrator: mi.Integrator) -> list[mi.Integrator]:
     if isinstance(nested, mi.Integrator):
         return [nested]
 
-    # Defined here, as the base class exists only once a variant is selected
+    # Defined here because the base class exists only once a variant is selected
     class Collector(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()

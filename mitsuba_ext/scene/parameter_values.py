@@ -1,4 +1,4 @@
-"""The parameters of a scene that have a value."""
+"""Iterates over the parameters of a scene that have a value."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def values_of(parameters: mi.SceneParameters) -> Iterator[tuple[str, Any]]:
     """Keys and values, without parameters that are ``None``, for which Mitsuba 3.9.1 raises a
-    ``TypeError``: ``sigma_a`` of ``hair``, where the pigments are given."""
+    ``TypeError`` (such as ``sigma_a`` of a ``hair`` given by its pigments)."""
     for key in parameters.keys():
         value, kind, *_ = parameters.properties[key]
         if value is not None or kind is not None:

@@ -1,4 +1,4 @@
-"""Meshes that stand in a scene for geometry that Mitsuba does not intersect."""
+"""Placeholder meshes for geometry that Mitsuba does not intersect."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from ..util.arrays import from_numpy
 
 
 def span(mesh: mi.Mesh, low: np.ndarray, high: np.ndarray) -> None:
-    """Gives ``mesh``, of three vertices and two faces, a box: that of the scene then contains it.
-    Its triangles have no area, so that no ray can hit them."""
+    """Gives ``mesh``, which has three vertices and two faces, a box that becomes part of the
+    scene's box. Its triangles have no area, so no ray can hit them."""
     parameters = mi.traverse(mesh)
     # Rounded outwards
     low = np.nextafter(np.asarray(low).astype(np.float32), np.float32(-np.inf))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-#: The most that the edges of a portal may differ from a right angle: the cosine between them.
+#: The maximum cosine of the angle between adjacent edges of a portal.
 _RIGHT_ANGLE = 1e-3
 
 
@@ -40,7 +40,7 @@ class Portal:
 
     @classmethod
     def of_matrix(cls, matrix: np.ndarray) -> Portal:
-        """The square from (−1, −1) to (1, 1) of the plane z = 0, transformed by ``matrix``; its z
+        """The square from (−1, −1) to (1, 1) in the plane z = 0, transformed by ``matrix``; its z
         axis points into the room.
 
         Raises:

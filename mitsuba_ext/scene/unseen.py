@@ -1,4 +1,4 @@
-"""Refuses to render shapes that only the integrators of this package see."""
+"""Refuses to render scenes with shapes that only the integrators of this package see."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from .nesting import class_name
 
 
 def has_unseen_shapes(scene: mi.Scene) -> bool:
-    """Does ``scene`` have shapes that Mitsuba's own integrators do not see?"""
+    """Whether ``scene`` has shapes that Mitsuba's own integrators do not see."""
     return bool(movers(scene) or lightweight_shapes(scene))
 
 
 def check_all_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
     """Refuses to render a scene with shapes that the integrator does not see.
 
-    Integrators that see them have the attribute ``sees_all``. Mitsuba's own integrators and those
-    of other packages would render the scene without the shapes that move, and without lightweight
-    shapes.
+    Integrators that see them have the attribute ``sees_all``. Mitsuba's own integrators and
+    integrators of other packages would render the scene without moving shapes and without
+    lightweight shapes.
 
     Raises:
-        NotImplementedError: The integrator does not see something in ``scene``.
+        NotImplementedError: The integrator does not see a shape in ``scene``.
     """
     if getattr(integrator, "sees_all", False):
         return

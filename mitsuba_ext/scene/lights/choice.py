@@ -1,4 +1,4 @@
-"""The light that was chosen for a connection."""
+"""The light chosen for a connection."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class Choice:
     """The choice of a light cell for a connection.
 
     Attributes:
-        row: Row of the table at the vertex.
+        row: The table row of the vertex.
         cell: The chosen light cell.
-        probability: The probability of that choice.
+        probability: The probability with which it was chosen.
     """
 
     row: mi.UInt32

@@ -1,10 +1,10 @@
 """Divides emitters into cells: parts of the surface that are rectangles of the unit square.
 
-``emitter.sample_direction`` maps a point of [0, 1)² to a point on the light. For rectangles,
-disks, cylinders and meshes the map does not depend on the point that is lit. A part of the square
-then is a part of the surface, and Mitsuba's own sampling, given points of that part, samples it.
-All other emitters stay whole: spheres, which are sampled by the solid angle of their cone, textured
-lights whose radiance varies much within the cells, and emitters that cannot be hit.
+``emitter.sample_direction`` maps a point of [0, 1)² to a point on the light. For rectangles, disks,
+cylinders and meshes, the map does not depend on the point that is lit. A part of the square is then
+a part of the surface, and Mitsuba's own sampling, given points of that part, samples it. All other
+emitters stay whole: spheres, which are sampled by the solid angle of their cone; textured lights
+whose radiance varies strongly within the cells; and emitters that rays cannot hit.
 
 Mitsuba samples a cylinder uniformly only if its cross-section is a circle, and warns otherwise.
 """
@@ -21,20 +21,22 @@ from ..lightweight_shapes import surface
 from ..regions.voxel_sides import SIDES, sides, voxel_number
 from .spectra import brightness, comparison_wavelengths
 
-#: Cells of one emitter, at most.
+#: The maximum number of cells of one emitter.
 _MAX_CELLS = 64
 
-#: Approximate number of cells of a scene that has fewer emitters than this.
+#: The approximate number of cells in a scene with fewer emitters than this.
 _CELL_BUDGET = 1024
 
-#: An edge is cut only if it is longer than a whole number of voxels by more than this.
+#: The fraction of a voxel by which an edge must exceed a whole number of voxels before it is cut
+#: once more.
 _TOLERANCE = 0.25
 
-#: A textured light is divided if sampling its cells by area has at most this many times the second
-#: moment of sampling its texture; and the points along each edge of a cell where that is measured.
-_UNEVENNESS, _TEXTURE_SAMPLES = 1.5, 16
+#: The maximum second moment of sampling the cells of a textured light by area, relative to sampling
+#: its texture, for which the light is divided; and the number of points along each edge of a cell
+#: at which it is measured.
+_MAX_UNEVENNESS, _TEXTURE_SAMPLES = 1.5, 16
 
-#: Cuts along each side of a triangle, at most.
+#: The maximum number of cuts along each side of a triangle.
 _MAX_CUTS = 8
 
 
@@ -44,16 +46,16 @@ class Division:
 
     Attributes:
         pieces: x, y, width and height of rectangles of the unit square; shape [pieces, 4]. Pieces
-            of one cell follow each other.
-        cell_sizes: Pieces of each cell; shape [cells].
+            of one cell are adjacent.
+        cell_sizes: The number of pieces of each cell; shape [cells].
         shape: ``""`` (whole), ``"rectangle"``, ``"disk"``, ``"cylinder"`` or ``"mesh"``.
-        grid: Columns and rows of the cells of a shape that is not a mesh.
+        grid: The numbers of columns and rows of cells of a shape that is not a mesh.
         normals: Geometric normal of each piece of a mesh; shape [pieces, 3].
         face_first: First piece of each face in the order (face, row, column); shape [faces + 1].
-        face_pieces: Where these pieces are found in ``pieces``.
-        is_smooth: Do the interpolated normals of the mesh differ from those of its faces?
-        is_textured: Does the radiance vary? Points are then sampled on the shape, since the emitter
-            would sample its texture.
+        face_pieces: The indices of these pieces in ``pieces``.
+        is_smooth: Whether the interpolated normals of the mesh differ from its face normals.
+        is_textured: Whether the radiance varies. Points are then sampled on the shape, because the
+            emitter would sample its texture.
     """
 
     pieces: np.ndarray
@@ -80,8 +82,8 @@ def emitter_shapes(scene: mi.Scene) -> list[mi.Shape | None]:
 
 
 def divide(scene: mi.Scene, voxel: np.ndarray | None) -> list[Division]:
-    """Divides the emitters into cells no larger than a ``voxel`` (its three edges; ``None`` leaves
-    them whole). The cells of a mesh also differ in the direction that they face."""
+    """Divides the emitters into cells no larger than ``voxel``, given by its three edges (``None``
+    leaves emitters whole). The cells of a mesh also separate faces of different orientation."""
     emitters = scene.emitters()
     limit = max(1, min(_MAX_CELLS, _CELL_BUDGET // max(1, len(emitters))))
     return [
@@ -124,8 +126,8 @@ def _divide_shape(shape: mi.Shape, voxel: np.ndarray | None, limit: int) -> Divi
 
 
 def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
-    """Is a textured emitter so even within its cells that sampling them by area, and choosing among
-    them, has at most ``_UNEVENNESS`` times the second moment of sampling the texture?"""
+    """Whether a textured emitter is uniform enough within its cells: choosing a cell and sampling
+    it by area has at most ``_MAX_UNEVENNESS`` times the second moment of sampling the texture."""
     if len(division.cell_sizes) == 1:
         return False
     n = _TEXTURE_SAMPLES
@@ -143,7 +145,7 @@ def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
     # At best, cells are chosen by the root of their mean square, and texels by their radiance
     by_texture = (area * value.mean(axis=1)).sum()
     # A light that is black, or has no area, is left whole
-    return by_texture > 0 and np.sqrt(share * square).sum() ** 2 <= _UNEVENNESS * by_texture**2
+    return by_texture > 0 and np.sqrt(share * square).sum() ** 2 <= _MAX_UNEVENNESS * by_texture**2
 
 
 def _edges(shape: mi.Shape, kind: str) -> np.ndarray:
@@ -154,13 +156,14 @@ def _edges(shape: mi.Shape, kind: str) -> np.ndarray:
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64)
     x, y, z = to_world[:3, :3].reshape(3, 3).T
     if kind == "cylinder":
-        # Columns along the axis; half of the circumference lies at right angles to it
+        # Columns run along the axis; half of the circumference lies at right angles to it
         return np.stack([z, np.pi * np.hypot(x, y)])
     return np.stack([2 * x, 2 * y])
 
 
 def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
-    """Cuts along two edges given in voxels, [2, 3], so that no cell is longer than a voxel."""
+    """The numbers of cells along two edges, given in voxels [2, 3], such that no cell is longer
+    than a voxel."""
     lengths = np.maximum(1, np.linalg.norm(edges, axis=1))
     lengths *= min(1.0, np.sqrt(limit / np.prod(lengths)))
     cuts = np.maximum(1, np.ceil(lengths - _TOLERANCE)).astype(int)
@@ -173,16 +176,16 @@ def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
 
 
 def are_interpolated(cosines: np.ndarray) -> bool:
-    """Do vertex normals, of these :func:`shading_cosines`, differ from the normals of faces? Being
-    opposite to them is no difference."""
+    """Whether vertex normals with these :func:`shading_cosines` differ from the face normals.
+    Normals that are exactly opposite do not count as different."""
     return bool(np.any(np.abs(cosines) < 1 - 1e-4))
 
 
 def shading_cosines(mesh: mi.Mesh) -> np.ndarray:
-    """Cosine between the three vertex normals and the normal of each face that has an area,
-    [3, faces]; empty for meshes without vertex normals. It is negative where vertex normals, to
-    whose side light leaves, lie on the other side of the face: a mirroring ``to_world`` turns the
-    faces of a mesh, but not its vertex normals."""
+    """The cosines between the three vertex normals and the face normal, for each face with an area;
+    [3, faces], empty for meshes without vertex normals. Light leaves on the side of the vertex
+    normals. A cosine is negative where that is the back of the face: a mirroring ``to_world`` turns
+    the faces of a mesh, but not its vertex normals."""
     if not mesh.has_vertex_normals() or mesh.has_face_normals():
         return np.zeros((3, 0))
     a, b, c = triangles(mesh)
@@ -209,10 +212,10 @@ def _normalized(v: np.ndarray) -> np.ndarray:
 def _divide_mesh(
     mesh: mi.Mesh, voxel: np.ndarray | None, limit: int, is_smooth: bool
 ) -> Division:
-    """Cuts large faces, and groups pieces that are close to each other and face the same way.
+    """Cuts large faces, and groups pieces that are close together and face the same way.
 
-    A mesh samples its faces by area, in their order, with the second coordinate of the unit
-    square. That coordinate, rescaled, and the first one then sample a point of the triangle.
+    A mesh samples its faces by area, in order, with the second coordinate of the unit square. The
+    first coordinate and the rescaled second one then sample a point of the triangle.
     """
     a, b, c = triangles(mesh)
     normal = _normalized(np.cross(b - a, c - a))
@@ -231,13 +234,13 @@ def _divide_mesh(
     height = (top - bottom)[piece_face] / n
     pieces = np.stack([column / n, bottom[piece_face] + row * height, 1 / n, height], axis=1)
 
-    # The middle of each piece, by the map of square_to_uniform_triangle
+    # The centre of each piece, by the map of square_to_uniform_triangle
     t = np.sqrt(np.maximum(0, 1 - (column + 0.5) / n))
     u, v = 1 - t, t * (row + 0.5) / n
     first = a[piece_face]
     middle = first + u[:, None] * (b[piece_face] - first) + v[:, None] * (c[piece_face] - first)
 
-    # Faces without area are never sampled: they make no cells of their own
+    # Faces without area are never sampled and get no cells
     has_area = height > 0
     if len(pieces) == 1 and not is_smooth:
         return Division(_WHOLE, np.ones(1, int))
@@ -253,9 +256,9 @@ def _divide_mesh(
 
 
 def _faces_in_square(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Begin and end of each face in the unit square's second coordinate.
+    """The beginning and the end of each face in the second coordinate of the unit square.
 
-    The sums are those of Mitsuba's own table, in single precision: with many faces, other sums
+    The sums equal those in Mitsuba's own table, in single precision: with many faces, other sums
     would select neighbours of the intended faces.
     """
     index = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
@@ -269,13 +272,13 @@ def _faces_in_square(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
 def _groups(
     middle: np.ndarray, normal: np.ndarray, voxel: np.ndarray | None, limit: int
 ) -> np.ndarray:
-    """Numbers, without gaps, of at most ``limit`` groups of pieces."""
+    """The group of each piece, numbered without gaps; at most ``limit`` groups."""
     if voxel is None:
         return np.zeros(len(middle), int)
     side = sides(normal)
     extent = np.ptp(middle, axis=0) / voxel
-    # Boxes of equal size: at first none is longer than a voxel, then they grow until there are at
-    # most ``limit`` groups
+    # Boxes of equal size, initially no longer than a voxel; they grow until there are at most
+    # ``limit`` groups
     boxes = np.clip(np.ceil(extent - _TOLERANCE), 1, limit)
     relative = (middle - middle.min(axis=0)) / np.maximum(np.ptp(middle, axis=0), 1e-300)
     while True:

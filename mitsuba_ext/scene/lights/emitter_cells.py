@@ -18,22 +18,22 @@ class EmitterCells:
 
     Parameters:
         scene: The scene that holds the emitters.
-        indices: The numbers, in the scene, of the emitters to divide; at least one.
-        voxel: The three edges of a box. Emitters that are longer are divided; with ``None``, each
-            emitter is one cell.
+        indices: The scene indices of the emitters to divide; at least one.
+        voxel: The three edges of a box. Longer emitters are divided; with ``None``, each emitter is
+            one cell.
 
     Attributes:
         count (int): Number of cells.
-        emitter_index (numpy.ndarray): The number, in the scene, of each cell's emitter; [count].
-        share (numpy.ndarray): The share of its emitter's area, and so of its emitter's samples,
-            that each cell has; shape [count].
-        has_smooth_meshes (bool): Is there a mesh with interpolated normals among the emitters?
-            Mitsuba's own sampling of such a mesh has a wrong density.
+        emitter_index (numpy.ndarray): The scene index of each cell's emitter; shape [count].
+        share (numpy.ndarray): The fraction of its emitter's area, and hence of its emitter's
+            samples, in each cell; shape [count].
+        has_smooth_meshes (bool): Whether an emitter is a mesh with interpolated normals. Mitsuba's
+            own sampling of such a mesh has a wrong density.
     """
 
     def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
-        # Kept alive: once the shape of an emitter is freed, the next call of the emitters of any
-        # scene ends the process
+        # Kept alive: once the shape of an emitter is freed, the next virtual call to the emitters
+        # of any scene crashes
         self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
         everything = divide(scene, edges)
@@ -55,8 +55,8 @@ class EmitterCells:
         )
         self._emitter = from_numpy(mi.UInt32, number)
         self._is_divided = any(d.shape for d in divisions)
-        # A textured emitter maps the unit square by its texture: points of its cells are sampled on
-        # its shape
+        # A textured emitter maps the unit square by its texture, so points of its cells are sampled
+        # on its shape
         self._by_area = [
             functools.partial(_sample_by_area, shapes[i], scene.emitters()[i])
             for i, d in zip(indices, divisions) if d.is_textured
@@ -67,7 +67,7 @@ class EmitterCells:
             self._textured_number = from_numpy(mi.UInt32, (np.cumsum(is_textured) - 1).clip(0))
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
-        # So that rounding does not move a sample into the neighbouring piece
+        # Keeps rounding from moving a sample into the neighbouring piece
         inset = np.minimum(2.0**-23, 0.25 * pieces[:, 2:]).T
         corner, size = pieces[:, :2].T + inset, pieces[:, 2:].T - 2 * inset
         # Corner and size of a piece side by side: one access to memory reads all four
@@ -76,7 +76,7 @@ class EmitterCells:
         if self._has_groups:
             self._last_piece = from_numpy(mi.UInt32, ends - 1)
             self._first_piece = from_numpy(mi.UInt32, ends - sizes)
-            # The running sum, within each cell, of the shares of its pieces
+            # Within each cell, the running sum of the shares of its pieces
             total = np.cumsum(measure)
             below = np.concatenate([[0.0], total])[ends - sizes]
             cumulative = (total - np.repeat(below, sizes)) / np.repeat(
@@ -93,8 +93,7 @@ class EmitterCells:
         cell_counts: np.ndarray,
         sizes: np.ndarray,
     ) -> None:
-        """Makes the tables that lead from an emitter, by its number in Dr.Jit's registry, to its
-        cells."""
+        """Makes the tables that map an emitter's index in Dr.Jit's registry to its cells."""
         ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
         kinds = {d.shape for d in divisions}
         self._kinds = kinds
@@ -119,7 +118,7 @@ class EmitterCells:
                                  for d in divisions])
         if "mesh" not in kinds:
             return
-        # Faces are numbered over all meshes. Entries of emitters that are no meshes are not used
+        # Faces are numbered over all meshes. Entries of emitters that are not meshes are not used
         face_counts = [len(d.face_first) - 1 if d.shape == "mesh" else 0 for d in divisions]
         self._first_face = by_id(np.cumsum(face_counts) - face_counts)
         self._is_mesh = by_id([d.shape == "mesh" for d in divisions])
@@ -185,7 +184,7 @@ class EmitterCells:
         return ds, weight
 
     def _sample_emitter(self, cell, ref, sample, active):
-        """The direction sample to which the cell's emitter maps a point of the unit square."""
+        """The direction sample that the cell's emitter assigns to a point of the unit square."""
         emitter = self._pointer(cell, active)
         if not self._by_area:
             return emitter.sample_direction(ref, sample, active)
@@ -194,14 +193,14 @@ class EmitterCells:
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
         textured &= active
         # Not by a call through a pointer: Dr.Jit would trace all shapes and emitters in memory,
-        # also those of other scenes, and some raise errors (a curve cannot be sampled by area)
+        # including other scenes, and some raise errors (a curve cannot be sampled by area)
         number = dr.gather(mi.UInt32, self._textured_number, number, textured)
         by_area, value = dr.switch(number, self._by_area, ref, sample, textured)
         by_area.emitter = mi.EmitterPtr(emitter)
         return dr.select(textured, by_area, ds), dr.select(textured, value, weight)
 
     def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
-        """Chooses a piece of ``cell`` by the random number ``x``.
+        """Chooses a piece of ``cell`` with the random number ``x``.
 
         Returns:
             The piece, and the number rescaled to [0, 1).
@@ -228,8 +227,8 @@ class EmitterCells:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The cell that a ray from ``ref`` hit at ``si``, and the density, conditional on the cell,
-        with which :meth:`sample` would sample the ray's direction."""
+        """The cell that a ray from ``ref`` hit at ``si``, and the density of the ray's direction
+        under :meth:`sample`, conditional on the cell."""
         id = dr.reinterpret_array(mi.UInt32, ds.emitter)
         textured = mi.Bool(False)
         if self._by_area:
@@ -255,7 +254,7 @@ class EmitterCells:
         return cell, dr.select(share > 0, pdf / share, 0)
 
     def _grid_cell(self, id, ds, active) -> mi.UInt32:
-        """The cell of a point on a rectangle, disk or cylinder: its number within the emitter."""
+        """The cell of a point on a rectangle, disk or cylinder, as its index within the emitter."""
         columns = dr.gather(mi.UInt32, self._columns, id, active)
         rows = dr.gather(mi.UInt32, self._rows, id, active)
         x, y = ds.uv.x, ds.uv.y
@@ -297,7 +296,7 @@ def _sample_by_area(
     sample: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Samples a point by the area of the emitter's shape; also returns its radiance / pdf."""
+    """Samples a point uniformly on the emitter's shape; also returns its radiance / pdf."""
     ds = shape.sample_direction(ref, sample, active)
     value = emitter.eval_direction(ref, ds, active)
     return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
@@ -308,7 +307,7 @@ def _area(shape: mi.Shape) -> float:
 
 
 def _slot(x: mi.Float, count: mi.UInt32) -> mi.UInt32:
-    """Which of ``count`` equal parts of [0, 1] holds ``x``."""
+    """The index of the one of ``count`` equal parts of [0, 1] that holds ``x``."""
     return dr.minimum(mi.UInt32(dr.maximum(x, 0) * mi.Float(count)), count - 1)
 
 

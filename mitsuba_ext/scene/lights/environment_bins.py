@@ -10,16 +10,17 @@ from ...util.arrays import from_numpy
 from ...util.discrete_sampling import ONE_MINUS_EPSILON, alias_tables
 from .environment_texels import EnvironmentTexels
 
-#: Bins along the azimuth and along the polar angle.
+#: The numbers of bins along the azimuth and along the polar angle.
 BINS = (32, 16)
 
 
 class EnvironmentBins:
     """Samples directions in rectangular bins of latitude and longitude.
 
-    Inside a bin, a texel is chosen by its brightness and a point in it by the bilinear function
-    that Mitsuba's ``envmap`` interpolates with: for maps the density of a bin is proportional to
-    its emission. The sun of a ``sunsky`` is one more bin, the last, cut out of the others.
+    Inside a bin, a texel is chosen by its brightness, and a point in it by the bilinear function
+    with which Mitsuba's ``envmap`` interpolates. For maps, the density in a bin is therefore
+    proportional to the emission. The sun of a ``sunsky`` is an additional, last bin, cut out of the
+    others.
 
     Parameters:
         scene: The scene with the environment emitter.
@@ -27,7 +28,7 @@ class EnvironmentBins:
     Attributes:
         count (int): Number of bins.
         pointer (mi.EmitterPtr): The emitter.
-        share (numpy.ndarray): Share of the emitted brightness in each bin; shape [count].
+        share (numpy.ndarray): The fraction of the emitted brightness in each bin; shape [count].
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -83,14 +84,15 @@ class EnvironmentBins:
         """
         if self._sun is not None:
             in_sun = bin == self.count - 1
-            bin = dr.minimum(bin, self.count - 2)  # a valid one; it is not used in the sun
+            bin = dr.minimum(bin, self.count - 2)  # valid, but unused in the sun
         texel, point = self._texel(bin, sample, active)
         point, density = mi.warp.square_to_bilinear(*self._corner_values(texel, active), point)
         d, sin_theta, uv = self._texels.direction(texel, point)
         pdf = density / sin_theta
         if self._sun is not None:
             d = dr.select(in_sun, self._sun.sample(sample), d)
-            # Samples of other bins in the sun's disk get density 0: they belong to the sun's bin
+            # Samples of other bins in the sun's disk get density 0 because they belong to the sun's
+            # bin
             is_lost = ~in_sun & self._sun.contains(d)
             pdf = dr.select(in_sun, 1 / self._sun.solid_angle, dr.select(is_lost, 0, pdf))
         ds = self._texels.directions.sample(ref, d)
@@ -100,8 +102,8 @@ class EnvironmentBins:
         return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
-        """The bin of the world space direction ``d``, and the density, conditional on the bin, with
-        which :meth:`sample` would sample it."""
+        """The bin of the world space direction ``d``, and the density of ``d`` under
+        :meth:`sample`, conditional on the bin."""
         column, row, point, sin_theta = self._texels.find(d)
         corners = self._corner_values(row * self._columns + column, active)
         density = mi.warp.square_to_bilinear_pdf(*corners, point)
@@ -117,7 +119,7 @@ class EnvironmentBins:
     def _texel(self, bin, sample, active) -> tuple[mi.UInt32, mi.Point2f]:
         """Chooses a texel of the bin in proportion to its weight (alias method).
 
-        A texel of the bin is chosen uniformly, and then is either taken or replaced by its alias.
+        A texel of the bin is chosen uniformly, and is then either taken or replaced by its alias.
 
         Returns:
             The texel, and the sample rescaled to [0, 1)².
@@ -126,8 +128,8 @@ class EnvironmentBins:
         bin_column = bin - bin_row * self._bins[0]
         column, x, width = _entry(bin_column, self._bins[0], self._columns, sample.x)
         row, y, _height = _entry(bin_row, self._bins[1], self._rows, sample.y)
-        # A rescaled number has few digits, too few for the small thresholds of dark texels beside
-        # the sun: the other coordinate supplies more of them
+        # A rescaled number has too few digits for the small thresholds of dark texels beside the
+        # sun; the other coordinate supplies more
         x = dr.minimum(dr.fma(y, width * 2.0**-23, x), ONE_MINUS_EPSILON)
         texel = row * self._columns + column
         entry = dr.gather(mi.Vector2u, self._entries, texel, active)
@@ -146,7 +148,7 @@ class EnvironmentBins:
 
 def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
     """Chooses one of the columns (or rows) of a bin uniformly. All ``count`` columns are divided
-    into ``parts``; those of the bin are ``part``.
+    into ``parts``, of which the bin has the one with index ``part``.
 
     Returns:
         The column, the random number rescaled to [0, 1), and the number of columns of the bin.

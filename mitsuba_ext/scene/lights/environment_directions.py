@@ -1,4 +1,4 @@
-"""The directions in which an environment emitter is seen."""
+"""Directions towards an environment emitter."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..bounds import scene_bounds
 
-#: The sine of the polar angle at the poles, where densities would be infinite.
+#: The minimum sine of the polar angle: at the poles, densities would be infinite.
 LEAST_SINE = 1e-7
 
 
@@ -19,18 +19,18 @@ class EnvironmentDirections:
 
     Attributes:
         emitter (mi.Emitter), pointer (mi.EmitterPtr): The emitter.
-        is_map (bool): Is the emitter an ``envmap``, whose emission is an image?
+        is_map (bool): Whether the emitter is an ``envmap``, whose emission is an image.
         center (mi.Point3f): Centre of the scene.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        self._scene = scene  # kept alive, as its emitter has to be
+        self._scene = scene  # kept alive, because its emitter must be
         self.emitter = scene.environment()
         self.pointer = mi.EmitterPtr(self.emitter)
         self.is_map = self.emitter.class_name() == "EnvironmentMapEmitter"
         bbox = scene_bounds(scene)
         sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
-        # So that samples lie behind all shapes, also after rounding
+        # Enlarged so that samples lie behind all shapes even after rounding
         self.center, self._radius = mi.Point3f(sphere.center), mi.Float(1.001 * sphere.radius)
         self._to_world = mi.Transform4f(self.emitter.world_transform())
         self._to_local = self._to_world.inverse()
@@ -63,10 +63,10 @@ class EnvironmentDirections:
         return self._to_world @ d, sin_theta
 
     def uv(self, d: mi.Vector3f) -> tuple[mi.Point2f, mi.Float]:
-        """The inverse of :meth:`direction`: a point, whose first coordinate is only known up to an
+        """The inverse of :meth:`direction`: a point, whose first coordinate is known only up to an
         integer, and the sine of the polar angle."""
         v = self._to_local @ d
         u = dr.atan2(v.x, -v.z) * dr.inv_two_pi
-        # Accurate near the poles, where the cosine does not change
+        # Accurate near the poles, where the cosine hardly changes
         sin_theta = dr.maximum(dr.sqrt(dr.square(v.x) + dr.square(v.z)), LEAST_SINE)
         return mi.Point2f(u, dr.atan2(sin_theta, v.y) * dr.inv_pi), sin_theta

@@ -10,25 +10,26 @@ from .environment_directions import EnvironmentDirections
 from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
 
-#: Nodes (columns, rows) at which emitters without a map are evaluated. Features smaller than the
-#: 0.35° between two nodes are found only if the emitter's own sampling finds them. The disk of the
-#: sun is left out.
+#: The numbers of columns and rows of nodes at which emitters without a map are evaluated. Features
+#: smaller than the 0.35° between two nodes are found only if the emitter's own sampling finds them.
+#: The disk of the sun is excluded.
 _NODES = (1024, 513)
 
-#: Nodes of a constant emitter, for which only sin θ is interpolated.
+#: The numbers of columns and rows of nodes of a constant emitter, for which only sin θ is
+#: interpolated.
 _CONSTANT_NODES = (64, 33)
 
-#: Samples that are taken by the own sampling of an emitter without a map.
+#: The number of samples taken with the emitter's own sampling if it has no map.
 _OWN_SAMPLES = 1 << 16
 
-#: Weight of black texels relative to the mean.
+#: The weight of black texels, relative to the mean.
 _FLOOR = 1e-3
 
 
 class EnvironmentTexels:
     """The brightness of an environment at the corners of texels, between which it is interpolated.
 
-    For maps these are the nodes between which Mitsuba's ``envmap`` interpolates: a density that is
+    For maps, these are the nodes between which Mitsuba's ``envmap`` interpolates, so a density
     interpolated in the same way is proportional to the emission.
 
     Parameters:
@@ -37,7 +38,7 @@ class EnvironmentTexels:
     Attributes:
         directions (EnvironmentDirections): The directions of the emitter.
         sun (SunDisk | None): The sun of a ``sunsky``. Its emission is not in the table.
-        columns, rows (int): Number of texels.
+        columns, rows (int): Numbers of texels.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -46,26 +47,26 @@ class EnvironmentTexels:
         self.sun = SunDisk.of(emitter)
         if self.directions.is_map:
             height, width = mi.traverse(emitter)["data"].shape[:2]
-            # Mitsuba adds two columns, which are copies. The first and the last row are the poles
+            # Mitsuba adds two columns, both copies. The first and the last row are the poles
             self.columns, self.rows = width - 2, height - 1
         else:
             is_constant = emitter.class_name() == "ConstantBackgroundEmitter"
             columns, rows = _CONSTANT_NODES if is_constant else _NODES
             self.columns, self.rows = columns, rows - 1
-        # Nodes of a map are the middles of its columns
+        # The nodes of a map are at the middles of its columns
         self._shift = 0.5 / self.columns
 
     def corners(self) -> np.ndarray:
         """Brightness times sin θ at the corners of each texel, all positive; shape [rows · columns,
-        4]. It is computed at each call: large maps are not kept in memory twice."""
+        4]. Computed at each call, so that large maps are not kept in memory twice."""
         node = self.nodes()
         corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1)
         return corners.reshape(-1, 4)
 
     @property
     def area(self) -> float:
-        """The factor from a mean over texels of brightness times sin θ to the integral of the
-        brightness over the sphere."""
+        """The factor that converts the mean over texels of brightness times sin θ to the integral
+        of the brightness over the sphere."""
         return 2 * np.pi**2
 
     def sun_emission(self) -> float:
@@ -111,7 +112,7 @@ class EnvironmentTexels:
     ) -> mi.Spectrum:
         """The radiance from the direction of ``ds``, whose ``uv`` is known."""
         if self.directions.is_map:
-            # By the sample's uv, without a search for the texel
+            # From the sample's uv, without searching for the texel
             return self.directions.emitter.eval_direction(ref, ds, active)
         return self.directions.radiance(ref, ds.d, active)
 
@@ -122,12 +123,12 @@ class EnvironmentTexels:
         index = dr.arange(mi.UInt32, columns * (rows + 1))
         row = index // columns
         u = mi.Float(index - row * columns) / columns + self._shift
-        # Not exactly at the poles: a direction there belongs to no column
+        # Not exactly at the poles, where a direction belongs to no column
         v = dr.clip(mi.Float(row), 1e-2, rows - 1e-2) / rows
         value = self._brightness(mi.Point2f(u, v)).numpy().reshape(rows + 1, columns)
         if not self.directions.is_map:
-            # The largest value around each node, and what the emitter's own samples found there: so
-            # that features between the nodes are not missed
+            # The largest value around each node, and the values of the emitter's own samples there,
+            # so that features between the nodes are not missed
             value = np.maximum(value, self._own_samples(value.shape))
             wide = np.maximum(value, np.maximum(np.roll(value, 1, 1), np.roll(value, -1, 1)))
             padded = np.pad(wide, ((1, 1), (0, 0)), mode="edge")

@@ -1,4 +1,5 @@
-"""All lights that next event estimation can choose: cells of emitters, bins of an environment."""
+"""All lights that next event estimation can choose: cells of emitters and bins of an
+environment."""
 
 from __future__ import annotations
 
@@ -20,19 +21,19 @@ class LightCells:
 
     Parameters:
         scene: A scene with at least one emitter.
-        voxel: The three edges of a box. Emitters that are longer are divided into cells, an
-            environment into bins. With ``None``, each emitter is one cell.
-        bins: The bins of the environment, if other cells of this scene have them: making them
-            takes a tenth of a second.
+        voxel: The three edges of a box. Longer emitters are divided into cells, and an environment
+            into bins. With ``None``, each emitter is one cell.
+        bins: The bins of the environment, if already made for other cells of this scene: making
+            them takes a tenth of a second.
 
     Attributes:
         count (int): Number of cells.
         bins (EnvironmentBins | None): The bins of the environment; ``None`` if it is not divided.
-        emitter_index (numpy.ndarray): The number of each cell's emitter; shape [count].
-        share (numpy.ndarray): The share of each cell in the area of its emitter, or in the emitted
-            brightness of the environment; shape [count].
-        has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
-            Mitsuba's own sampling of such a mesh has a wrong density.
+        emitter_index (numpy.ndarray): The scene index of each cell's emitter; shape [count].
+        share (numpy.ndarray): The fraction of its emitter's area, or of the environment's emitted
+            brightness, in each cell; shape [count].
+        has_smooth_meshes (bool): Whether a light is a mesh with interpolated normals. Mitsuba's own
+            sampling of such a mesh has a wrong density.
     """
 
     def __init__(
@@ -59,8 +60,8 @@ class LightCells:
             self.emitter_index[self._first_bin :] = index
 
     def tabulated(self) -> LightCells:
-        """The same cells, for :meth:`sample` only; of an environment, it knows a few directions of
-        each bin (:class:`TabulatedBins`)."""
+        """The same cells, for :meth:`sample` only, with a few fixed directions in each bin of an
+        environment (:class:`TabulatedBins`)."""
         if self.bins is None:
             return self
         other = copy.copy(self)
@@ -92,8 +93,8 @@ class LightCells:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The cell that a ray from ``ref`` hit at ``si``, and the density, conditional on the cell,
-        with which :meth:`sample` would sample the ray's direction."""
+        """The cell that a ray from ``ref`` hit at ``si``, and the density of the ray's direction
+        under :meth:`sample`, conditional on the cell."""
         if self.bins is None:
             return self._emitters.pdf(ref, si, ds, active)
         escaped = active & (ds.emitter == self.bins.pointer)

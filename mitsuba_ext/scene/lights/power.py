@@ -15,12 +15,12 @@ from ..movers import is_moving_light
 from .division import emitter_shapes
 from .spectra import brightness
 
-#: Samples of an emitter.
+#: The number of samples of each emitter.
 _SAMPLES = 256
 
-#: The most texels of a spot's texture that are evaluated: of larger textures, only some are. And
-#: the points along each edge of a texture that is not a bitmap.
-_MOST_TEXELS, _POINTS = 1 << 22, 256
+#: The maximum number of texels evaluated of a spot's texture (a larger one is subsampled), and the
+#: number of points along each edge of a texture that is not a bitmap.
+_MAX_TEXELS, _POINTS = 1 << 22, 256
 
 
 def emitter_powers(scene: mi.Scene) -> np.ndarray:
@@ -52,7 +52,7 @@ def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
         e.nested.get_shape() if is_moving_light(e) else shape
         for e, shape in zip(scene.emitters(), emitter_shapes(scene))
     ]
-    # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, also those of
+    # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, including those of
     # other scenes
     senders = [functools.partial(_radiated, at_rest[i], shapes[i]) for i in indices]
     index, sampler = _lanes(len(indices))
@@ -66,7 +66,7 @@ def _radiated(
     """A sample of an emitter's power, from uniform numbers."""
     try:
         weight = emitter.sample_ray(0.0, x, y, z)[1]
-    except RuntimeError:  # its texture cannot choose wavelengths (a checkerboard, an attribute)
+    except RuntimeError:  # its texture cannot sample wavelengths (a checkerboard, an attribute)
         if shape is None:
             return dr.zeros(mi.Float, dr.width(x))
         ps = shape.sample_position(0.0, y)
@@ -79,8 +79,8 @@ def _radiated(
 
 def _sent_in(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
     """The power that emitters at infinity send into the bounding sphere. Their directions are
-    sampled, not their rays: Mitsuba starts such rays on a disk of the scene's size, which is wrong
-    where rectangles were merged (``bounds.py``)."""
+    sampled, not their rays, because Mitsuba starts such rays on a disk of the scene's size, which
+    is wrong where rectangles were merged (``bounds.py``)."""
     if len(indices) == 0:
         return np.zeros(0)
     bbox = scene_bounds(scene)
@@ -111,14 +111,14 @@ def _wavelengths(sample: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def _means(value: mi.Float, count: int) -> np.ndarray:
-    # Where an emitter sends the same everywhere, Mitsuba returns an array of one value
+    # If an emitter's value is constant, Mitsuba returns an array of one value
     value = mi.Float64(value + dr.zeros(mi.Float, count * _SAMPLES))
     return dr.block_sum(dr.select(dr.isfinite(value), value, 0), _SAMPLES).numpy() / _SAMPLES
 
 
 def _texture_size(emitter: mi.Emitter) -> tuple[int, int] | None:
     """Width and height of the texture of a spot; ``None`` for all other emitters, and for spots
-    without a texture. (Mitsuba samples rays of a spot without regard to its texture.)"""
+    without a texture. (Mitsuba ignores the texture when it samples rays of a spot.)"""
     is_textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
     if emitter.class_name() != "SpotLight" or not is_textured:
         return None
@@ -126,12 +126,12 @@ def _texture_size(emitter: mi.Emitter) -> tuple[int, int] | None:
     if "texture.data" not in parameters:
         return _POINTS, _POINTS
     height, width = parameters["texture.data"].shape[:2]
-    step = max(1, math.ceil(math.sqrt(height * width / _MOST_TEXELS)))
+    step = max(1, math.ceil(math.sqrt(height * width / _MAX_TEXELS)))
     return math.ceil(width / step), math.ceil(height / step)
 
 
 def _spot_power(emitter: mi.Emitter, width: int, height: int) -> float:
-    """The sum over texels, which divide a square in the plane at the distance 1 from the spot."""
+    """The power of a spot: a sum over texels, which divide a square in the plane at distance 1."""
     angle = float(dr.slice(mi.traverse(emitter)["cutoff_angle"]))
     edge = 2 * math.tan(math.radians(angle))
     index = dr.arange(mi.UInt32, width * height)

@@ -1,4 +1,5 @@
-"""Intervals of the time while a shutter is open, in which moving lights have different places."""
+"""Divides the time while a shutter is open into intervals with different positions of moving
+lights."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ import mitsuba as mi
 
 from ..movers import is_moving_light
 
-#: Intervals where lights move. With lamps that cross the scene, 8 have 0.63 times the error of one,
-#: and 32 no less than 8.
+#: The number of intervals if lights move. With lamps that cross the scene, 8 intervals have 0.63
+#: times the error of one, and 32 have no less error than 8.
 _INTERVALS = 8
 
 
@@ -20,7 +21,7 @@ class ShutterTimes:
         sensor: The sensor with the shutter.
 
     Attributes:
-        count (int): Number of intervals: 1 where no light moves, or the shutter shows one moment.
+        count (int): Number of intervals; 1 if no light moves or the shutter opens for an instant.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
@@ -36,7 +37,7 @@ class ShutterTimes:
         return dr.minimum(mi.UInt32(x * self.count), self.count - 1)
 
     def sample(self, index: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
-        """A random time in an interval; its begin if there is only one interval."""
+        """A random time in an interval; the beginning of the interval if there is only one."""
         if self.count == 1:
             return mi.Float(self._begin)
         x = (mi.Float(index) + sampler.next_1d()) / self.count

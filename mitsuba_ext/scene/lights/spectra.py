@@ -1,4 +1,4 @@
-"""Spectra as single numbers, by which lights are compared."""
+"""Reduces spectra to single numbers, with which lights are compared."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def brightness(value: mi.Spectrum) -> mi.Float:
 
 
 def comparison_wavelengths(width: int) -> mi.Spectrum:
-    """The wavelengths at which lights are compared: those of the sample 0.5 in spectral variants,
-    none in the others."""
+    """The wavelengths at which lights are compared: the wavelengths sampled with 0.5 in spectral
+    variants, none in the others."""
     wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
     if mi.is_spectral:
         wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]

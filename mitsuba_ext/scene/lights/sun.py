@@ -11,14 +11,15 @@ import numpy as np
 from ...util.arrays import from_numpy
 from .spectra import brightness, comparison_wavelengths
 
-#: Angles at which the edge of the disk is searched, up to the largest aperture, in radians.
+#: Angles at which the edge of the disk is searched for, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)
 
-#: The sun is treated as a disk only if it is this many times brighter, at its edge, than the sky.
+#: The minimum ratio of the sun's brightness at its edge to the sky's for treating the sun as a
+#: disk.
 _CONTRAST = 4.0
 
-#: The sampled disk is larger than the sun by this factor: Mitsuba compares cosines in single
-#: precision with that of the edge, which blurs the edge by half a percent.
+#: The ratio of the sampled disk's angle to the sun's: Mitsuba compares cosines with the cosine of
+#: the edge in single precision, which blurs the edge by half a percent.
 _MARGIN = 1.015
 
 
@@ -49,11 +50,12 @@ class SunDisk:
         if emitter.class_name() != "SunskyEmitter" or "sun_direction" not in parameters:
             return None
         sun = dr.normalize(mi.Vector3f(parameters["sun_direction"]))
-        # Upwards: at sunset, the lower half of the disk is below the horizon
+        # The edge is searched for upwards: at sunset, the lower half of the disk is below the
+        # horizon
         zenith = emitter.world_transform() @ mi.Vector3f(0, 0, 1)
         upwards = zenith - sun * dr.dot(zenith, sun)
         length = dr.norm(upwards)
-        # Where the sun stands in the zenith, any direction does
+        # If the sun is at the zenith, any direction will do
         upwards = dr.select(
             length > 1e-3, upwards / dr.maximum(length, 1e-3), mi.coordinate_system(sun)[0]
         )
@@ -69,7 +71,7 @@ class SunDisk:
         return cls(sun, _MARGIN * _ANGLES[edge + 1])
 
     def contains(self, d: mi.Vector3f) -> mi.Bool:
-        """Does the direction ``d`` lie in the disk?"""
+        """Whether the direction ``d`` lies in the disk."""
         return dr.squared_norm(d - self.direction) < self._square
 
     def sample(self, sample: mi.Point2f) -> mi.Vector3f:
@@ -81,7 +83,7 @@ class SunDisk:
         return mi.Frame3f(self.direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))
 
     def invert(self, d: mi.Vector3f) -> mi.Point2f:
-        """The sample with which :meth:`sample` gives the direction ``d`` of the disk."""
+        """The sample that :meth:`sample` maps to the direction ``d`` in the disk."""
         p = mi.Frame3f(self.direction).to_local(d)
         square = dr.squared_norm(d - self.direction)
         scale = math.sqrt(self._square) * dr.sqrt(dr.maximum(1 - 0.25 * square, 1e-6))

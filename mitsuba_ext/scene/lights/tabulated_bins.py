@@ -1,4 +1,4 @@
-"""A few samples of each bin of an environment, taken in advance."""
+"""A few precomputed samples of each bin of an environment."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import mitsuba as mi
 from .environment_bins import EnvironmentBins
 from .spectra import brightness, comparison_wavelengths
 
-#: Directions along each of the two axes of a bin.
+#: The number of directions along each of the two axes of a bin.
 _SIDE = 8
 
 
 class TabulatedBins:
-    """Samples bins as :class:`EnvironmentBins`, but only directions of a table: what an environment
-    emits depends on no place, and to evaluate a sky at each place takes long. A bin at the horizon
-    that is nearly black may have no light in the table, and must not be excluded for that.
+    """Samples bins like :class:`EnvironmentBins`, but only tabulated directions: emission of an
+    environment does not depend on position, and evaluating a sky at each point is slow. In a nearly
+    black bin at the horizon, all tabulated values can be zero; such a bin must not be excluded.
 
     Parameters:
         bins: The bins.
@@ -37,7 +37,7 @@ class TabulatedBins:
     def sample(
         self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """A direction in ``bin``, of which only ``d`` is set, and its brightness / pdf, in all
+        """A direction sample in ``bin`` with only ``d`` set, and its brightness / pdf in all
         channels."""
         place = mi.UInt32(sample.x * _SIDE) * _SIDE + mi.UInt32(sample.y * _SIDE)
         place += bin * _SIDE**2

@@ -1,5 +1,5 @@
-"""Sums of an environment's emission over rectangles of texels, and samples in proportion to the
-emission times a function that is given at the corners of a rectangle.
+"""Sums of an environment's emission over rectangles of texels, and sampling in proportion to the
+emission times a function given at the corners of a rectangle.
 
 Source: Cline, PhD dissertation, section 5.2.1 and appendix 5A.
 """
@@ -34,7 +34,7 @@ class Corners:
         """The values at the corners of both halves.
 
         Parameters:
-            by_x: Is the rectangle divided across x, or across y?
+            by_x: Whether the rectangle is divided across x instead of y.
             low, high: The values at the ends of the dividing line.
         """
         kind = type(self)
@@ -49,7 +49,7 @@ class Corners:
 
 
 @dataclass
-class Sums(Corners):
+class CornerSums(Corners):
     """Values at the corners of a rectangle, in double precision."""
 
     v00: mi.Float64
@@ -63,9 +63,10 @@ class Rectangle:
     """Texels x0 ≤ x < x1, y0 ≤ y < y1.
 
     Attributes:
-        f: A function at the corners.
+        f: The values of a function at the corners.
         sums: The summed-area table of the emission at the corners, relative to the total emission;
-            in double precision, as dark texels beside a sun are small differences of large sums.
+            in double precision, because dark texels beside a sun are small differences of large
+            sums.
     """
 
     x0: mi.UInt32
@@ -73,11 +74,11 @@ class Rectangle:
     x1: mi.UInt32
     y1: mi.UInt32
     f: Corners
-    sums: Sums
+    sums: CornerSums
 
     @property
     def share(self) -> mi.Float:
-        """The share of the texels in the total emission."""
+        """The fraction of the total emission that the texels have."""
         s = self.sums
         # Sums grow along each row and column; only rounding could make the difference negative
         return mi.Float(dr.maximum((s.v11 - s.v01) - (s.v10 - s.v00), 0))
@@ -107,7 +108,8 @@ class TexelSums:
         self._sums = from_numpy(mi.Float64, sums / sums[-1, -1])
         self._nodes = from_numpy(mi.Float, node / node.max())
         self._stride = dr.opaque(mi.UInt32, texels.columns + 1)
-        #: The factor from the probability of a texel to a density on the sphere, without 1 / sin θ.
+        #: The factor that converts the probability of a texel to a density on the sphere, without 1
+        #: / sin θ.
         self._density = dr.opaque(mi.Float, texels.columns * texels.rows / texels.area)
 
     def rectangle(
@@ -119,10 +121,10 @@ class TexelSums:
         f: Corners,
         active: mi.Bool,
     ) -> Rectangle:
-        """A rectangle of texels, with a function that is known at its corners."""
+        """A rectangle of texels, with a function given at its corners."""
         corners = ((x0, y0), (x1, y0), (x0, y1), (x1, y1))
         return Rectangle(
-            x0, y0, x1, y1, f, Sums(*(self._sum(x, y, active) for x, y in corners))
+            x0, y0, x1, y1, f, CornerSums(*(self._sum(x, y, active) for x, y in corners))
         )
 
     def _sum(self, x, y, active) -> mi.Float64:
@@ -143,7 +145,7 @@ class TexelSums:
             number = dr.select(by_x, point.x, point.y)
             is_low = number < of_low
             of_side = dr.select(is_low, of_low, 1 - of_low)
-            # A side that was chosen has a positive probability
+            # The chosen side has a positive probability
             number = dr.minimum(
                 (number - dr.select(is_low, 0, of_low)) / of_side, ONE_MINUS_EPSILON
             )
@@ -167,8 +169,9 @@ class TexelSums:
         sin_theta: mi.Float,
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Float]:
-        """The random numbers with which :meth:`sample` gives a direction in a rectangle, and its
-        density there. The direction is given by the results of :meth:`EnvironmentTexels.find`."""
+        """The random numbers that :meth:`sample` maps to a direction in a rectangle, and the
+        density of that direction. The direction is given by the results of
+        :meth:`EnvironmentTexels.find`."""
         probability, first, size = mi.Float(1), mi.Point2f(0), mi.Point2f(1)
         while dr.hint(active & _is_divisible(inside), label="warp back"):
             by_x, low, high, of_low = self._halves(inside, active)
@@ -208,11 +211,11 @@ class TexelSums:
         )
 
     def _halves(self, r: Rectangle, active):
-        """Divides a rectangle across its longer side, with the function interpolated: is it divided
-        across x, the halves, and the probability of the first one."""
+        """Divides a rectangle across its longer side and interpolates the function. Returns whether
+        it is divided across x, the halves, and the probability of the first one."""
         width, height = r.x1 - r.x0, r.y1 - r.y0
         by_x = width > height
-        # The dividing line is not in the middle where the number of texels is odd
+        # The dividing line is not in the middle if the number of texels is odd
         side = dr.select(by_x, width, height)
         t = mi.Float(side // 2) / mi.Float(side)
         f_low = dr.lerp(r.f.v00, dr.select(by_x, r.f.v10, r.f.v01), t)
@@ -237,13 +240,13 @@ class TexelSums:
 def part_of(
     first: mi.Point2f, size: mi.Point2f, by_x: mi.Bool, is_low: mi.Bool, share: mi.Float
 ) -> tuple[mi.Point2f, mi.Point2f]:
-    """The random numbers that lead to one of two halves of a rectangle, as their least values and
-    the size of their range, from those that lead to the whole.
+    """Narrows a range of random numbers that lead to a rectangle to those that lead to one of its
+    halves. A range is given by its smallest values and its size.
 
     Parameters:
-        by_x: Do the halves lie side by side along x?
-        is_low: Is it the first one?
-        share: The probability with which it is chosen.
+        by_x: Whether the halves lie side by side along x.
+        is_low: Whether the half is the first one.
+        share: The probability of the half.
     """
     first = first + dr.select(is_low, mi.Point2f(0), size) * _along(by_x, 1 - share, 0)
     return first, size * _along(by_x, share, 1)

@@ -16,21 +16,21 @@ from .power import emitter_powers
 from .shutter_times import ShutterTimes
 from .spectra import brightness, comparison_wavelengths
 
-#: Least weight of a cell, relative to the mean of its row (as in pbrt).
+#: The minimum weight of a cell, relative to the mean of its row (as in pbrt).
 _FLOOR = 1e-3
 
-#: The least and the largest number of points of a row at which a cell is evaluated. The largest
-#: number in voxels is pbrt's.
+#: The minimum and the maximum number of points of a row at which a cell is evaluated. The maximum
+#: for voxels is pbrt's.
 _VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
-#: Approximate number of evaluations of all cells in all rows, within these bounds, and once more
+#: The approximate number of evaluations of all cells in all rows, within these bounds, and again
 #: for the brighter cells.
 _EVALUATIONS = 1 << 22
 
-#: Added to the cosine at a surface: its shading normal may differ from the geometric one.
-_LEAST_COSINE = 0.02
+#: Added to the cosine at a surface because its shading normal may differ from the geometric one.
+_ADDED_COSINE = 0.02
 
-#: Evaluations of one kernel launch.
+#: The number of evaluations per kernel launch.
 _CHUNK = 1 << 21
 
 
@@ -49,7 +49,7 @@ def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
     weights = emitter_powers(scene) * sampling_weight
     weights /= max(weights.max(), 1e-300)
     cell = weights[cells.emitter_index] * cells.share
-    # An emitter whose power was estimated as 0, or is lost in rounding, must still be chosen
+    # An emitter whose power was estimated as 0, or is lost in rounding, must still be selectable
     cell = np.maximum(cell, _FLOOR * (cell.mean() or 1.0))
     cell[sampling_weight[cells.emitter_index] <= 0] = 0
     return from_numpy(mi.Float, cell)
@@ -80,9 +80,9 @@ class VoxelRows:
 
 
 def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.Float:
-    """The mean radiance / pdf with which each cell arrives at points of a voxel, whether visible or
-    not (as in pbrt-v3's ``SpatialLightDistribution``), during an interval of time; shape
-    [rows · cells]."""
+    """The mean radiance / pdf that arrives from each cell at points of a voxel, ignoring visibility
+    (as in pbrt-v3's ``SpatialLightDistribution``), during an interval of time; shape [rows ·
+    cells]."""
 
     def arrives(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
         p, time = rows.sample(row, sampler)
@@ -93,8 +93,8 @@ def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.F
 
 
 def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> mi.Float:
-    """The root mean square of the contribution of each cell to a white diffuse surface of each row
-    without occlusion; shape [rows · cells]."""
+    """The root mean square of each cell's unoccluded contribution to a white diffuse surface in
+    each row; shape [rows · cells]."""
     lights = cells.tabulated()
 
     def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float64:
@@ -103,7 +103,7 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
         index += dr.gather(mi.UInt32, rows.first, row)
         # Moving lights are evaluated at time 0; pilots see the other times
         value, d = _light(lights, cell, dr.gather(mi.Point3f, rows.p, index), mi.Float(0), sampler)
-        cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
+        cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _ADDED_COSINE
         # In double precision: the square of a bright light may exceed the range of single precision
         return dr.square(mi.Float64(value * cosine))
 
@@ -130,12 +130,12 @@ def _means(
     bounds: tuple[int, int],
     measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float | mi.Float64],
 ) -> mi.Float | mi.Float64:
-    """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape
-    [rows · cells]. Where the budget does not allow the largest number of samples for all cells,
-    those above the mean of their row are measured again, with more samples.
+    """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape [rows
+    · cells]. If the budget does not allow the maximum number of samples for all cells, the cells
+    above the mean of their row are measured again with more samples.
 
     Parameters:
-        bounds: The least and the largest number of samples of a cell in a row.
+        bounds: The minimum and the maximum number of samples of a cell in a row.
     """
     pairs = dr.arange(mi.UInt32, rows * cells)
     samples = _sample_count(len(pairs), bounds)
@@ -173,8 +173,8 @@ def _means_of(
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
     """Completes the weights: multiplies them by ``sampling_weight``, raises each to at least a
-    share of its row's mean (in a row that no light reaches, all weights are equal), and appends the
-    last row, which stands for all other points and is the mean of the others."""
+    fraction of its row's mean (in a row that no light reaches, all weights are equal), and appends
+    the last row, which stands for all other points and is the mean of the others."""
     count = cells.count
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()], dtype=np.float32)
     factor = mi.Float(sampling_weight[cells.emitter_index])

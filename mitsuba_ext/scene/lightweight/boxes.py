@@ -1,4 +1,5 @@
-"""Boxes as rows of lower and upper corners. Shape (6, …), float32; empty ones are upside down."""
+"""Boxes as rows of lower and upper corners. Shape (6, …), float32; the corners of empty boxes are
+swapped."""
 
 from __future__ import annotations
 
@@ -6,23 +7,23 @@ import functools
 
 import numpy as np
 
-#: NumPy takes long to reduce axes that are shorter than this.
-_SHORT = 8
+#: The axis length below which NumPy's reductions are slow.
+_SHORT_AXIS = 8
 
 
 def around(boxes: np.ndarray) -> np.ndarray:
-    """The boxes around those along the last axis."""
+    """The bounding boxes of the boxes along the last axis."""
     return np.concatenate([_reduced(np.minimum, boxes[:3]), _reduced(np.maximum, boxes[3:])])
 
 
 def area(boxes: np.ndarray) -> np.ndarray:
-    """Half the surface of boxes."""
+    """Half the surface area of each box."""
     x, y, z = boxes[3:] - boxes[:3]
     return x * y + y * z + z * x
 
 
 def _reduced(union: np.ufunc, values: np.ndarray) -> np.ndarray:
-    while (size := values.shape[-1]) > _SHORT:
+    while (size := values.shape[-1]) > _SHORT_AXIS:
         half = size // 2
         folded = union(values[..., :half], values[..., half : 2 * half])
         if size % 2:

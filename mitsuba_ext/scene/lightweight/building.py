@@ -1,10 +1,10 @@
 """Builds the tree over the triangles of a mesh: a top tree over treelets (Cline 2007, sections
 3.3.2 and 3.4.2).
 
-Treelets are heaps. Each of their nodes is split twice in two. The counts of both halves are given
-by the shape of the heap; the axis along which the triangles are separated is free. The source takes
-the longest one. Here, each node takes the one with the smallest expected cost, by the surface areas
-of the halves.
+Treelets are heaps. Each of their nodes is split in two twice. The shape of the heap determines the
+counts of both halves; the axis along which the triangles are separated is free. The source takes
+the longest axis. Here, each node takes the axis with the smallest expected cost, from the surface
+areas of the halves.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from .heap import ARITY, LEAF_SIZE, Heap
 from .sorting import separated
 from .top import Top
 
-#: How many triangles a thread sorts at a time.
+#: The number of triangles that a thread sorts at a time.
 _CHUNK = 1 << 16
 
-#: Bits of the number of a treelet's inner nodes; nodes of the top tree have ``TOP``.
+#: The number of bits for the number of a treelet's inner nodes; nodes of the top tree have ``TOP``
+#: instead.
 INNER_BITS = 5
 TOP = (1 << INNER_BITS) - 1
 
-#: The box of no triangle.
+#: The bounding box of no triangles.
 _EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, dtype=np.float32)[:, None, None]
 
 
@@ -39,12 +40,12 @@ class Hierarchy:
 
     Attributes:
         children: The boxes of the four children of each inner node, lower and upper corners as
-            rows; empty ones are upside down. Shape (6, nodes, 4), float32.
-        headers: For each treelet, its first inner node, times 32, plus their number; and its first
-            leaf. For each node of the top tree, the node, times 32, plus ``TOP``; and the number of
-            its first child. Shape (numbers, 2), uint32.
-        order: The triangles, sorted by treelets and leaves. Shape (triangles,), uint32.
-        stack_size: How many children wait at most while a ray traverses the tree.
+            rows; the corners of empty boxes are swapped. Shape (6, nodes, 4), float32.
+        headers: For each treelet, the index of its first inner node times 32 plus the number of its
+            inner nodes, and the index of its first leaf. For each node of the top tree, its index
+            times 32 plus ``TOP``, and the index of its first child. Shape (numbers, 2), uint32.
+        order: The triangles, sorted by treelet and leaf. Shape (triangles,), uint32.
+        stack_size: The maximum number of children that wait while a ray traverses the tree.
     """
 
     children: np.ndarray
@@ -58,7 +59,7 @@ def build(boxes: np.ndarray) -> Hierarchy:
 
     Parameters:
         boxes: Lower and upper corners of the triangles' boxes, as rows. Shape (6, triangles),
-            float32. They are sorted from left to right.
+            float32. They are sorted in place, from left to right.
     """
     order = np.arange(boxes.shape[1], dtype=np.uint32)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -88,7 +89,7 @@ def build(boxes: np.ndarray) -> Hierarchy:
 
 
 def _groups(size: np.ndarray, is_treelet: np.ndarray) -> Iterator[np.ndarray]:
-    """The numbers of treelets of one size that are sorted together."""
+    """The indices of treelets of one size that are sorted together."""
     for n in np.unique(size[is_treelet]):
         treelets, step = np.flatnonzero(is_treelet & (size == n)), max(1, _CHUNK // int(n))
         for k in range(0, len(treelets), step):
@@ -102,8 +103,8 @@ def _sort_treelets(
     """Sorts the triangles of treelets of one size, and writes the boxes of their nodes.
 
     Parameters:
-        start: The first triangles of the treelets.
-        node: Their first inner nodes.
+        start: The first triangle of each treelet.
+        node: The first inner node of each treelet.
     """
     places = start[:, None] + np.arange(heap.counts[0])
     mine, triangles = boxes[:, places], order[places]
@@ -113,7 +114,7 @@ def _sort_treelets(
             _separate(mine, triangles, run.start, run.nodes, a + b + c + d, a + b)
             if (a, b) == (c, d):
                 _separate(mine, triangles, run.start, 2 * run.nodes, a + b, a)
-            else:  # This node is alone in its run
+            else:  # this node is alone in its run
                 _separate(mine, triangles, run.start, 1, a + b, a)
                 _separate(mine, triangles, run.start + a + b, 1, c + d, c)
     order[places] = heap.by_leaf(triangles)
@@ -152,7 +153,7 @@ def _boxes_of_nodes(boxes: np.ndarray, heap: Heap) -> np.ndarray:
     """The boxes of the nodes of treelets. Shape (6, treelets, nodes).
 
     Parameters:
-        boxes: Those of their triangles from left to right. Shape (6, treelets, triangles).
+        boxes: The boxes of their triangles from left to right. Shape (6, treelets, triangles).
     """
     result = np.empty((*boxes.shape[:2], len(heap.counts)), dtype=np.float32)
     result[:3], result[3:] = np.inf, -np.inf

@@ -1,9 +1,9 @@
 """Divides a mesh into treelets.
 
-The source splits all nodes into given counts, as the shape of its tree demands. In a scene as one
-mesh, walls then share nodes with small things, and rays take twice to three times as long. So the
-upper splits are free: each takes the place and the axis with the smallest expected cost by the
-surface areas of the halves [1], among places between whole leaves.
+The source splits all nodes into fixed counts, which the shape of its tree requires. If a whole
+scene is one mesh, walls then share nodes with small objects, and rays take two to three times as
+long. Here, the upper splits are therefore free: each takes the position and the axis with the
+smallest expected cost by the surface areas of the halves [1], among positions between whole leaves.
 
 [1] Wald. On fast Construction of SAH-based Bounding Volume Hierarchies. IEEE Symposium on
 Interactive Ray Tracing, 2007.
@@ -21,25 +21,25 @@ from .boxes import area, around
 from .heap import CAPACITY, LEAF_SIZE
 from .sorting import separated, sorted_rows
 
-#: How many triangles of a larger part decide on its split.
+#: The number of triangles of a larger part that are sampled to choose its split.
 _SAMPLE = 1024
 
-#: How many triangles a thread splits at a time.
+#: The number of triangles that a thread splits at a time.
 _CHUNK = 1 << 16
 
-#: After so many splits one below the other, parts are split in the middle: the depth of the tree is
-#: bounded.
+#: The maximum depth of free splits. Below it, parts are split in the middle, which bounds the depth
+#: of the tree.
 _FREE_ROUNDS = 40
 
 
 @dataclass
-class Division:
-    """A binary tree of parts; those that are not split are treelets.
+class TreeletDivision:
+    """A binary tree of parts; the parts that are not split are treelets.
 
     Attributes:
         start: The first triangle of each part, from left to right. Shape (parts,).
-        size: How many triangles it has.
-        left: Its first half; the second one follows. -1 for a treelet.
+        size: The number of triangles of each part.
+        left: The index of its first half, which the second half follows; -1 for a treelet.
         rounds: The parts of each depth.
     """
 
@@ -52,7 +52,7 @@ class Division:
         """The boxes of all parts. Shape (6, parts).
 
         Parameters:
-            boxes: Those of the triangles from left to right. Shape (6, triangles).
+            boxes: The boxes of the triangles from left to right. Shape (6, triangles).
         """
         treelets = np.flatnonzero(self.left < 0)
         treelets = treelets[np.argsort(self.start[treelets])]
@@ -67,15 +67,15 @@ class Division:
         return result
 
 
-def divide(boxes: np.ndarray, order: np.ndarray, pool: Executor) -> Division:
+def divide(boxes: np.ndarray, order: np.ndarray, pool: Executor) -> TreeletDivision:
     """Divides triangles into treelets of at most ``CAPACITY``.
 
     Parameters:
         boxes: Lower and upper corners of the triangles' boxes, as rows. Shape (6, triangles),
-            float32. Sorted from left to right.
-        order: The triangles; sorted along.
+            float32. They are sorted in place, from left to right.
+        order: The indices of the triangles; sorted in the same way.
     """
-    division = Division(np.array([0]), np.array([boxes.shape[1]]), np.array([-1]))
+    division = TreeletDivision(np.array([0]), np.array([boxes.shape[1]]), np.array([-1]))
     first = 0
     while first < len(division.start):
         parts = range(first, len(division.start))
@@ -99,7 +99,8 @@ def divide(boxes: np.ndarray, order: np.ndarray, pool: Executor) -> Division:
 
 
 def _groups(size: np.ndarray) -> Iterator[np.ndarray]:
-    """Parts that are split together: the large ones alone, others with those of similar size."""
+    """Groups of parts that are split together: each large part alone, others with parts of similar
+    size."""
     for part in np.flatnonzero(size > _SAMPLE):
         yield np.array([part])
     widths = np.where(size > _SAMPLE, 0, _width(size))
@@ -110,7 +111,7 @@ def _groups(size: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _width(size: np.ndarray) -> np.ndarray:
-    """The power of two from ``size`` on."""
+    """The smallest power of two that is at least ``size``."""
     return 1 << np.ceil(np.log2(size)).astype(np.int64)
 
 
@@ -127,7 +128,7 @@ def _split(
     parts[:3, ~exists], parts[3:, ~exists] = np.inf, -np.inf
     axes, cuts, orders = _cheapest(parts, size, is_free)
     by_centre = places.ravel()[orders[axes, np.arange(len(axes))]]
-    # Sorted rows keep what does not exist at their ends
+    # Sorted rows keep missing entries at their ends
     source, target = by_centre[exists], places[exists]
     for row in (*boxes, order):
         row[target] = row[source]
@@ -152,7 +153,7 @@ def _cheapest(
 
     Parameters:
         boxes: Shape (6, rows, width), a multiple of the size of a leaf; empty boxes at the ends.
-        size: How many triangles a row has, more than a leaf.
+        size: The number of triangles in each row, more than in a leaf.
 
     Returns:
         The axis of each row, the number of triangles on the left, and for each axis the order in
@@ -177,16 +178,16 @@ def _cheapest(
             leaves = around(sorted_boxes.reshape(6, rows, -1, LEAF_SIZE))
             costs[k] = left * area(_first(leaves))[:, :-1]
             costs[k] += right * area(_first(leaves[..., ::-1]))[:, -2::-1]
-        # Where many triangles are in one place, all splits cost the same: the middle is best
+        # If many triangles coincide, all splits cost the same, and the middle is best
         costs *= 1 + 1e-3 * np.abs(right - left) / size[:, None].astype(np.float32)
-    # In huge meshes, areas overflow
+    # In huge meshes, areas can overflow
     costs = np.where(allowed, np.fmin(costs, np.finfo(np.float32).max), np.inf)
     best = costs.transpose(1, 0, 2).reshape(rows, -1).argmin(axis=1)
     return best // len(left), left[best % len(left)], orders
 
 
 def _first(boxes: np.ndarray) -> np.ndarray:
-    """The boxes around the first ones of each row: around one, around two, and so on."""
+    """The bounding boxes of the first one, two, three, … boxes of each row."""
     low, high = (
         union.accumulate(corners, axis=2)
         for union, corners in ((np.minimum, boxes[:3]), (np.maximum, boxes[3:]))

@@ -1,4 +1,4 @@
-"""What the walk asks of a shape whose triangles are not in Mitsuba's scene."""
+"""The interface of shapes whose triangles are not in Mitsuba's scene."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import mitsuba as mi
 
 
 class Lightweight:
-    """The geometry of a lightweight shape, which does not refer to that shape: they would keep each
-    other alive.
+    """The geometry of a lightweight shape. It holds no reference to the shape, because the two
+    would keep each other alive.
 
     Attributes:
-        surface (mi.Shape | None): The shape of surface interactions, which computes them. ``None``
-            if they are computed by :meth:`interaction`; they then have the lightweight shape.
+        surface (mi.Shape | None): The shape that computes surface interactions. ``None`` if
+            :meth:`interaction` computes them; their shape is then the lightweight shape.
     """
 
     surface: mi.Shape | None = None
@@ -22,7 +22,7 @@ class Lightweight:
         raise NotImplementedError
 
     def occluded(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-        """Is there any hit before ``ray.maxt``?"""
+        """Whether there is a hit before ``ray.maxt``."""
         raise NotImplementedError
 
     def interaction(

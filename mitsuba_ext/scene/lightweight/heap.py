@@ -1,8 +1,8 @@
 """The shape of a treelet: an essentially complete tree with four children for each node, indexed
 like a heap, so that neither nodes nor leaves need pointers (Cline 2007, section 3.3.1).
 
-Node ``q`` has the children ``4q + 1`` to ``4q + 4``. Leaves follow the last inner node. They hold
-four triangles each, in the order of their indices; the last ones hold fewer or none.
+Node ``q`` has the children ``4q + 1`` to ``4q + 4``. Leaves follow the last inner node. In the
+order of their indices, they hold four triangles each; the last ones hold fewer or none.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Children of a node, and triangles of a leaf (Cline 2007, section 3.4.3).
+#: The numbers of children of a node and of triangles of a leaf (Cline 2007, section 3.4.3).
 ARITY, LEAF_SIZE = 4, 4
 
 
 @dataclass(frozen=True)
-class Run:
-    """Neighbouring nodes of one level whose children hold equally many triangles.
+class NodeRun:
+    """Neighbouring nodes of one level whose children hold equal numbers of triangles.
 
     Attributes:
         start: The first triangle of the first node, from left to right.
-        nodes: How many nodes.
-        children: How many triangles each child of a node holds.
+        nodes: The number of nodes.
+        children: The number of triangles in each child of a node.
     """
 
     start: int
@@ -31,14 +31,14 @@ class Run:
 
 
 class Heap:
-    """The tree over a number of triangles.
+    """The tree over a given number of triangles.
 
     Parameters:
-        triangles: How many triangles, at least one.
+        triangles: The number of triangles, at least one.
 
     Attributes:
         inner: The number of inner nodes, which is the index of the first leaf.
-        counts: How many triangles are below each node. Shape (nodes,).
+        counts: The number of triangles below each node. Shape (nodes,).
         levels: The inner nodes of each level, from the root down.
     """
 
@@ -59,23 +59,23 @@ class Heap:
             self.counts[level.start : level.stop] = self.of_children(level).sum(axis=1)
 
     def of_children(self, level: range) -> np.ndarray:
-        """How many triangles the children of a level's nodes hold. Shape (nodes, 4)."""
+        """The number of triangles in each child of a level's nodes. Shape (nodes, 4)."""
         return self.counts[ARITY * level.start + 1 : ARITY * level.stop + 1].reshape(-1, ARITY)
 
-    def runs(self, level: range) -> list[Run]:
-        """The nodes of a level in runs, at most three: where the tree ends on the bottom row, where
-        that row stops, and where it ends one row above."""
+    def runs(self, level: range) -> list[NodeRun]:
+        """The nodes of a level in at most three runs: above the bottom row, at its end, and beyond
+        it."""
         children = self.of_children(level)
         changes = np.flatnonzero(np.any(children[1:] != children[:-1], axis=1)) + 1
         edges = [0, *changes.tolist(), len(children)]
         starts = np.concatenate([[0], np.cumsum(children.sum(axis=1))])
         return [
-            Run(int(starts[a]), b - a, tuple(map(int, children[a])))
+            NodeRun(int(starts[a]), b - a, tuple(map(int, children[a])))
             for a, b in zip(edges[:-1], edges[1:])
         ]
 
     def leaves_from_left(self) -> np.ndarray:
-        """The leaves from left to right: those of the bottom row come first."""
+        """The leaves from left to right: the leaves of the bottom row come first."""
         bottom = self._bottom
         return np.concatenate([
             np.arange(bottom, len(self.counts), dtype=np.int32),
@@ -83,10 +83,10 @@ class Heap:
         ])  # fmt: skip
 
     def by_leaf(self, triangles: np.ndarray) -> np.ndarray:
-        """Sorts triangles by the indices of their leaves.
+        """Sorts values of triangles by the indices of their leaves.
 
         Parameters:
-            triangles: Something for each triangle, from left to right. Shape (…, triangles).
+            triangles: A value for each triangle, from left to right. Shape (…, triangles).
         """
         on_bottom = int(self.counts[self._bottom :].sum())
         return np.concatenate([triangles[..., on_bottom:], triangles[..., :on_bottom]], axis=-1)
@@ -97,10 +97,10 @@ class Heap:
         return max(ARITY * self.levels[-1].start + 1, self.inner)
 
 
-#: The largest treelet: the source proposes "a few thousand triangles" (section 3.4.2). In smaller
-#: ones, more splits follow the triangles. With 256, rays in scenes take 1.15 times as long, and
-#: nodes have 2.8 instead of 3.3 bytes for each triangle.
+#: The maximum number of triangles in a treelet. The source proposes "a few thousand triangles"
+#: (section 3.4.2). With smaller treelets, more splits adapt to the triangles. With 256, rays take
+#: 1.15 times as long, and nodes take 2.8 instead of 3.3 bytes per triangle.
 CAPACITY = 64
 
-#: Bits of the index of a node in its treelet.
+#: The number of bits of a node's index in its treelet.
 HEAP_BITS = int(len(Heap(CAPACITY).counts) - 1).bit_length()

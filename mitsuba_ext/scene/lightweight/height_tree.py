@@ -1,11 +1,11 @@
 """The tree of a grid of heights: a quadtree with ranges of heights (Cline 2007, section 3.3.3).
 
-Where a node lies in the grid follows from its number. A leaf is a block of 2 x 2 cells, with eight
-triangles. An inner node holds the ranges of its four children in 16 bytes: all levels together take
-1.33 bytes for each cell of the grid.
+The position of a node in the grid follows from its number. A leaf is a block of 2 x 2 cells, with
+eight triangles. An inner node holds the ranges of its four children in 16 bytes: all levels
+together take 1.33 bytes per grid cell.
 
-Unlike there, the grid may have any size. The nodes of a level are a grid of their own, and
-children outside of the heights have an empty range.
+Unlike in the source, the grid may have any size. The nodes of a level form a separate grid, and
+children outside the heights have an empty range.
 """
 
 from __future__ import annotations
@@ -18,26 +18,28 @@ from ...util.arrays import from_numpy
 from .slabs import ERROR, with_inverse
 from .traversal import NONE, Hit, traverse
 
-#: A node's number holds its x, its y, and its depth, which is 0 for the root.
+#: The number of bits for x and for y in a node's number, which also holds its depth (0 for the
+#: root).
 _BITS = 14
 _MASK, _DEPTH = (1 << _BITS) - 1, 1 << 2 * _BITS
 
-#: The number of a triangle holds the column and the row of its cell, and which of the two it is.
+#: The number of bits for the column and for the row of the cell in a triangle's number, which also
+#: says which of the two triangles it is.
 _CELL_BITS = _BITS + 1
 _CELL_MASK = (1 << _CELL_BITS) - 1
 
-#: The largest number of cells along a side of the grid.
+#: The maximum number of cells along a side of the grid.
 MOST_CELLS = 1 << _CELL_BITS
 
-#: Ranges of heights are stored as numbers from 0 to this.
+#: The largest number with which ranges of heights are stored.
 _RANGE = 0xFFFF
 
-#: How many heights are read at a time.
+#: The number of heights read at a time.
 _CHUNK = 1 << 20
 
 
 class Heights:
-    """Heights on the device: single precision in a word each, or 16 bits.
+    """Heights on the device: in single precision, one per word, or with 16 bits.
 
     Parameters:
         values: Shape (rows, columns); float32, float16 or uint16.
@@ -55,7 +57,7 @@ class Heights:
         self._words = from_numpy(mi.Float if self._is_float else mi.UInt32, values)
         self._stride = mi.UInt32(values.shape[1])
         self.columns, self.rows = mi.UInt32(columns), mi.UInt32(rows)
-        # Opaque: other grids share the kernel
+        # Opaque so that other grids share the kernel
         dr.make_opaque(self._stride, self.columns, self.rows)
 
     def at(self, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
@@ -66,7 +68,7 @@ class Heights:
         return self._decoded(word >> ((column & 1) << 4) & 0xFFFF)
 
     def block(self, x: mi.UInt32, y: mi.UInt32) -> list[list[mi.Float]]:
-        """The three rows of heights of a block. Those outside of the grid are arbitrary."""
+        """The three rows of heights of a block. Heights outside the grid are arbitrary."""
         rows = [2 * y, 2 * y + 1, dr.minimum(2 * y + 2, self.rows - 1)]
         if self._is_float:
             columns = [2 * x, 2 * x + 1, dr.minimum(2 * x + 2, self.columns - 1)]
@@ -84,7 +86,7 @@ class Heights:
     def _decoded(self, number: mi.UInt32) -> mi.Float:
         if not self._is_half:
             return mi.Float(mi.Int32(number))
-        # The exponent of half precision counts from 15, that of single precision from 127
+        # The exponent bias is 15 in half precision and 127 in single precision
         size = number & 0x7FFF
         normal = dr.reinterpret_array(mi.Float, (size << 13) + ((127 - 15) << 23))
         size = dr.select(size < 1 << 10, mi.Float(mi.Int32(size)) * 2.0**-24, normal)
@@ -94,8 +96,8 @@ class Heights:
 class HeightTree:
     """A tree over heights.
 
-    All is in the space of the grid, in which a vertex has its column, its row and its height as
-    coordinates. These are exact in single precision.
+    All coordinates are in the space of the grid, in which a vertex has its column, its row and its
+    height as coordinates. They are exact in single precision.
 
     Parameters:
         values: The heights, finite. Shape (rows, columns), at least (2, 2) and at most
@@ -104,13 +106,14 @@ class HeightTree:
     Attributes:
         heights (Heights): The heights on the device.
         low, high (float): The lowest and the highest height.
-        nbytes (int): The memory of heights and nodes.
+        nbytes (int): The memory of heights and nodes, in bytes.
     """
 
     def __init__(self, values: np.ndarray) -> None:
         self.heights = Heights(values)
         self.low, self.high = float(values.min()), float(values.max())
-        # Rounded up, so that no number exceeds the largest one; not zero where all is flat
+        # Rounded up so that no number exceeds the largest one; not zero even if all heights are
+        # equal
         unit = max((self.high - self.low) / _RANGE, 1e-30)
         unit = float(np.nextafter(np.float32(unit), np.float32(np.inf)))
         levels, widths = _nodes(*_ranges_of_blocks(values, self.low, unit))
@@ -124,29 +127,29 @@ class HeightTree:
         self.bottom, self.unit = mi.Float(self.low), mi.Float(unit)
         size = (values.shape[1], values.shape[0], max(abs(self.low), abs(self.high)))
         self.extent = mi.Vector3f(size)
-        # Opaque: the trees of other grids share the kernel
+        # Opaque so that the trees of other grids share the kernel
         dr.make_opaque(self.depth, self.bottom, self.unit, self.extent)
 
     def closest(self, ray: mi.Ray3f, active: mi.Bool) -> Hit:
-        """The closest hit of each ray of the grid's space before ``ray.maxt``."""
+        """The closest hit before ``ray.maxt`` of each ray, given in the grid's space."""
         ray = dr.detach(ray)
         t, triangle, _ = traverse(_RaysInTree(self, ray), ray, active, any_hit=False)
         x, y, is_right = cell(triangle)
         u = dr.fma(t, ray.d.x, ray.o.x) - mi.Float(mi.Int32(x))
         v = dr.fma(t, ray.d.y, ray.o.y) - mi.Float(mi.Int32(y))
-        # Rounding errors of the position are kept inside of the triangle
+        # Keeps the position inside the triangle despite rounding errors
         u, v = dr.fmin(dr.fmax(u, 0), 1), dr.fmin(dr.fmax(v, 0), 1)  # NaN without a hit
         b, c = dr.select(is_right, u - v, u), dr.select(is_right, v, v - u)
         b, c = dr.maximum(b, 0), dr.maximum(c, 0)
         return t, triangle, mi.Point2f(b, dr.minimum(c, 1 - b))
 
     def occluded(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-        """Is there any hit before ``ray.maxt``?"""
+        """Whether there is a hit before ``ray.maxt``."""
         return traverse(_RaysInTree(self, ray), ray, active, any_hit=True)[1] != NONE
 
 
 def cell(triangle: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
-    """The column and the row of a triangle's cell, and whether it is the right one.
+    """The column and the row of a triangle's cell, and whether it is the cell's right triangle.
 
     With the vertices 00, 10 (one column on), 01 (one row on) and 11, the triangles of a cell are
     (00, 11, 01) and, on the right, (00, 10, 11).
@@ -198,14 +201,15 @@ class _RaysInTree:
             (near_x, far_x), (near_y, far_y) = columns[c & 1], rows[c >> 1]
             enter = dr.maximum(dr.maximum(near_x, near_y), dr.maximum(near, 0))
             leave = dr.minimum(dr.minimum(far_x, far_y), dr.minimum(far, maxt))
-            # An empty range is upside down
+            # An empty range has its ends swapped
             boxes.append((enter, (enter <= leave) & (low <= high)))
         # Twice x and y
         first = (depth + 1) * _DEPTH | (node & (_DEPTH - 1)) << 1
         return boxes, lambda c: first | c & 1 | c >> 1 << _BITS
 
     def _sides(self, k: int, node: mi.UInt32, size: mi.Float) -> list[tuple[mi.Float, mi.Float]]:
-        """Where rays enter and leave the first and the second child of a node, along an axis."""
+        """The distances at which rays enter and leave the first and the second child of a node,
+        along an axis."""
         first, error = 2 * mi.Float(mi.Int32(node)), self._error[k]
         a, b, c = (
             ((first + i) * size - self._rays.o[k]) * self._rays.inverse[k] for i in range(3)
@@ -225,17 +229,17 @@ class _RaysInTree:
 
 
 class _Block:
-    """How rays meet the cells of a leaf.
+    """The intersections of rays with the cells of a leaf.
 
     A ray is cut into pieces at the lines of the grid and at the diagonals of its cells. The
-    distance of a cut depends on the ray and the line alone, and the height above the surface there
-    only on the edge. A triangle is hit where the ray is above the surface at one end of its piece
-    and not at the other. Neighbouring triangles share these ends with equal bits: no ray passes
+    distance of a cut depends only on the ray and the line, and the height above the surface there
+    only on the edge. A triangle is hit if the ray is above the surface at one end of its piece and
+    not at the other. Neighbouring triangles compute these ends with equal bits, so no ray passes
     between them.
 
-    The test for triangles of meshes takes as long. But it depends on angles, and in this space,
-    where heights are often small compared with cells, nearly all rays graze the surface: its
-    distances have errors that are hundreds of times larger.
+    The test for mesh triangles takes as long. But it depends on angles, and in this space, heights
+    are often small compared with cells and nearly all rays graze the surface, so its distances
+    would have errors hundreds of times as large.
     """
 
     def __init__(self, rays: _Rays, heights: Heights, leaf: mi.UInt32) -> None:
@@ -262,15 +266,15 @@ class _Block:
             self._at_y.append((t, above))
 
     def _above(self, t: mi.Float, along: mi.Float, a: mi.Float, b: mi.Float) -> mi.Float:
-        """How high a ray is above an edge at a distance."""
-        # The surface remains between both heights, and meets each with its bits
+        """The height of a ray above an edge at a distance."""
+        # The surface stays between both heights, and equals each of them bit for bit at its end
         along = dr.clip(along, 0, 1)
         return dr.fma(t, self._rays.d.z, self._rays.o.z) - dr.fma(along, b, (1 - along) * a)
 
     def intersect(
         self, column: int, row: int, t: mi.Float, triangle: mi.UInt32
     ) -> tuple[mi.Float, mi.UInt32]:
-        """The closest hit, with those of a cell."""
+        """The closest of a previous hit and the hits in a cell."""
         rays = self._rays
         start, end, above_start, above_end = self._piece(column, row)
         (h00, h10), (h01, h11) = (self._heights[r][column : column + 2] for r in (row, row + 1))
@@ -280,7 +284,7 @@ class _Block:
         above_cut = dr.select(cut <= start, above_start, above_cut)
         above_cut = dr.select(cut >= end, above_end, above_cut)
         cut = dr.minimum(dr.maximum(cut, start), end)
-        # Slopes of the triangle in front of the diagonal, and of the one behind it
+        # The slopes of the triangles in front of and behind the diagonal
         is_right = rays.d_diagonal < 0
         left, right = (h11 - h01, h01 - h00), (h10 - h00, h11 - h10)
         first = [dr.select(is_right, a, b) for a, b in zip(right, left)]
@@ -297,7 +301,8 @@ class _Block:
         return dr.select(is_hit, new, t), dr.select(is_hit, index, triangle)
 
     def _piece(self, column: int, row: int) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-        """Where a ray enters and leaves a cell, and how high it is above the surface there."""
+        """The distances at which a ray enters and leaves a cell, and its heights above the surface
+        there."""
         ends = []
         for lines, k, edge, d in (
             (self._at_x, column, row, self._rays.d.x), (self._at_y, row, column, self._rays.d.y)
@@ -317,11 +322,13 @@ class _Block:
         )  # fmt: skip
 
     def _crossing(self, o, slopes, start: mi.Float, end: mi.Float) -> mi.Float:
-        """Where a ray meets a plane through the vertex 00, from which ``o`` counts."""
+        """The distance at which a ray meets a plane through the vertex 00; ``o`` is relative to
+        this vertex."""
         d = self._rays.d
         above = dr.fma(-slopes[0], o[0], dr.fma(-slopes[1], o[1], o[2]))
         change = dr.fma(-slopes[0], d.x, dr.fma(-slopes[1], d.y, d.z))
-        # In a plane, the quotient may be anything, also NaN, which these functions drop
+        # For a ray in the plane, the quotient may be anything, even NaN, which these functions
+        # discard
         return dr.fmin(dr.fmax(-above / change, start), end)
 
 
@@ -344,7 +351,8 @@ def _ranges_of_blocks(
 
 
 def _unions(union: np.ufunc, values: np.ndarray) -> np.ndarray:
-    """The union of rows 0 to 2, of rows 2 to 4, and so on; the last may be of two rows."""
+    """The union of rows 0 to 2, of rows 2 to 4, and so on; the last union may have only two
+    rows."""
     result = union(values[:-1:2], values[1::2])
     last = values[2::2]
     union(result[: len(last)], last, out=result[: len(last)])
@@ -352,10 +360,10 @@ def _unions(union: np.ufunc, values: np.ndarray) -> np.ndarray:
 
 
 def _nodes(lows: np.ndarray, highs: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
-    """The words of the nodes of each depth, and how many nodes are in a row there."""
+    """The words of the nodes of each depth, and the number of nodes per row there."""
     levels, widths = [], []
     while not levels or lows.size > 1:
-        # Rows and columns of an even number
+        # Pads to even numbers of rows and columns
         pad = [(0, n % 2) for n in lows.shape]
         lows = np.pad(lows, pad, constant_values=_RANGE)
         highs = np.pad(highs, pad, constant_values=0)

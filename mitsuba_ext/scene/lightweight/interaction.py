@@ -1,4 +1,4 @@
-"""The surface interaction at a triangle that Mitsuba does not know."""
+"""The surface interaction at a triangle outside Mitsuba's scene."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import mitsuba as mi
 
 @dataclass
 class Triangle:
-    """A triangle in world space, as Mitsuba's meshes have them.
+    """A triangle in world space, with the same data as in Mitsuba's meshes.
 
     Attributes:
         corners: The three corners.
         normals: Shading normals at the corners, not zero; ``None`` if the triangle is flat.
         uv: Texture coordinates at the corners; ``None`` if they are barycentric.
-        is_flipped: Do normals point to the other side?
+        is_flipped: Whether normals point to the other side.
     """
 
     corners: Sequence[mi.Point3f]
@@ -48,7 +48,7 @@ def surface_interaction(
         scale = dr.rsqrt(dr.squared_norm(n))
         n *= scale
         si.sh_frame.n = mi.Normal3f(n)
-        # Of the normalized normal, along the edges from the first corner
+        # Derivatives of the normalized normal along the edges from the first corner
         du, dv = mi.Vector3f(n1 - n0) * scale, mi.Vector3f(n2 - n0) * scale
         si.dn_du, si.dn_dv = du - n * dr.dot(n, du), dv - n * dr.dot(n, dv)
     if triangle.is_flipped:

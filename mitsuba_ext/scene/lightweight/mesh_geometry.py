@@ -1,4 +1,4 @@
-"""A mesh of Mitsuba whose triangles are found by our tree."""
+"""A Mitsuba mesh whose triangles are intersected with our tree."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .mesh_tree import MeshTree, positions_and_faces
 
 
 class MeshGeometry(Lightweight):
-    """A mesh that is in no scene of Mitsuba's.
+    """The geometry of a mesh that is not in Mitsuba's scene.
 
     Parameters:
         mesh: The mesh. Its faces are sorted by the leaves of the tree.
 
     Attributes:
-        nbytes (int): The memory of the tree.
+        nbytes (int): The memory of the tree, in bytes.
     """
 
     def __init__(self, mesh: mi.Mesh) -> None:
@@ -41,14 +41,14 @@ class MeshGeometry(Lightweight):
 
 
 def sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndarray) -> None:
-    """Sorts the triangles of a mesh into an order."""
+    """Puts the triangles of a mesh into the given order."""
     for key in parameters.keys():
         if key.startswith("face_"):
             values = parameters[key].numpy().reshape(len(faces), -1)
             parameters[key] = from_numpy(mi.Float, values[order])
     parameters["faces"] = from_numpy(mi.UInt32, faces[order])
-    # As if the vertices had changed: Mitsuba then computes the areas of a light's triangles again,
-    # and keeps the normals, if there are any
+    # Reported as changed vertices: Mitsuba then recomputes the areas of a light's triangles, and
+    # keeps existing normals
     for key in ("vertex_positions", "vertex_normals"):
         parameters.set_dirty(key)
     parameters.update()

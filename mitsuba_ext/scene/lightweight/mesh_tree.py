@@ -1,4 +1,4 @@
-"""The tree of a mesh: how it is built, and how rays meet its nodes and leaves."""
+"""The tree of a mesh: its construction, and the intersections of rays with its nodes and leaves."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .slabs import ERROR, with_inverse
 from .traversal import NONE, Hit, traverse
 from .triangles import Projection
 
-#: How many triangles are read at a time.
+#: The number of triangles read at a time.
 _CHUNK = 1 << 18
 
 #: The number of the first leaf.
 LEAF = 1 << 31
 
-#: Stacks have a multiple of this size.
+#: Stack sizes are multiples of this.
 _STACK_STEP = 48
 
 
-class Corners(Protocol):
+class TriangleCorners(Protocol):
     """The triangles of a mesh, in the order of the tree."""
 
     def corners(self, triangle: mi.UInt32, active: mi.Bool) -> list[mi.Point3f]:
@@ -34,8 +34,8 @@ class Corners(Protocol):
 
 
 def positions_and_faces(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices of a mesh, and those of each triangle. Shapes (vertices, 3), (triangles, 3). On
-    the CPU, this is the memory of the mesh.
+    """The vertices of a mesh, and the vertex indices of each triangle. Shapes (vertices, 3),
+    (triangles, 3). On the CPU, this is the memory of the mesh.
 
     Raises:
         ValueError: A vertex is not finite.
@@ -59,11 +59,11 @@ class MeshTree:
         faces: The vertices of each triangle. Shape (triangles, 3), uint32.
 
     Attributes:
-        order: The triangles in the order of the leaves, in which ``Corners`` have them. Shape
+        order: The triangles in the order of the leaves, as in ``TriangleCorners``. Shape
             (triangles,), uint32.
-        grid (Grid): The space in which boxes are stored.
-        nbytes (int): The memory of the nodes.
-        stack_size (int): How many nodes the stack of a traversal holds.
+        grid (Grid): The grid in whose units boxes are stored.
+        nbytes (int): The memory of the nodes, in bytes.
+        stack_size (int): The capacity of a traversal's stack, in nodes.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -73,26 +73,26 @@ class MeshTree:
         del boxes
         words = self.words(hierarchy.children)
         self.order = hierarchy.order
-        # Few different ones, so that trees share the kernel
+        # Rounded up to one of few sizes, so that trees share the kernel
         self.stack_size = -(-hierarchy.stack_size // _STACK_STEP) * _STACK_STEP
         self.nbytes = words.nbytes + hierarchy.headers.nbytes
         self.nodes = from_numpy(mi.UInt32, words)
         self.headers = from_numpy(mi.UInt32, hierarchy.headers)
         self.low, self.scale = mi.Point3f(self.grid.low), mi.Vector3f(self.grid.scale)
         self.size = mi.UInt32(len(faces))
-        # Opaque: the trees of other meshes share the kernel
+        # Opaque so that the trees of other meshes share the kernel
         dr.make_opaque(self.low, self.scale, self.size)
 
     def words(self, children: np.ndarray) -> np.ndarray:
         """The nodes as they are stored. Shape (nodes, words)."""
         return encode(children, self.grid)
 
-    def closest(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> Hit:
+    def closest(self, ray: mi.Ray3f, corners: TriangleCorners, active: mi.Bool) -> Hit:
         """The closest hit of each ray before ``ray.maxt``."""
         return traverse(RaysInTree(self, ray, corners), ray, active, any_hit=False)
 
-    def occluded(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> mi.Bool:
-        """Is there any hit before ``ray.maxt``?"""
+    def occluded(self, ray: mi.Ray3f, corners: TriangleCorners, active: mi.Bool) -> mi.Bool:
+        """Whether there is a hit before ``ray.maxt``."""
         return traverse(RaysInTree(self, ray, corners), ray, active, any_hit=True)[1] != NONE
 
 
@@ -101,7 +101,7 @@ class RaysInTree:
 
     root = 0
 
-    def __init__(self, tree: MeshTree, ray: mi.Ray3f, corners: Corners) -> None:
+    def __init__(self, tree: MeshTree, ray: mi.Ray3f, corners: TriangleCorners) -> None:
         self._tree, self._corners, self._projection = tree, corners, Projection(ray)
         self.stack_size = tree.stack_size
         # In the space of the grid, with the same distances

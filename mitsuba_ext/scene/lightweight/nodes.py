@@ -3,9 +3,9 @@
 Cline 2007 stores boxes as bytes or shorts relative to the box of the mesh. Bytes are too coarse for
 meshes of more than a few thousand triangles, and shorts take twice the memory of bytes. Here, bytes
 are relative to the node itself. Its lower corner is a point of a grid over the mesh, with 16 bits
-for each coordinate. The unit of its bytes is a power of two of the grid's, for each axis (as in
-[1]). All that is exact in single precision. With four triangles in a leaf, nodes take 3.2 bytes
-for each triangle, where shorts take 4.7, and boxes are nearly as tight as floats.
+for each coordinate. For each axis, the unit of its bytes is a power of two times the grid's unit
+(as in [1]). All these numbers are exact in single precision. With four triangles in a leaf, nodes
+take 3.2 bytes per triangle (with shorts, 4.7), and boxes are nearly as tight as with floats.
 
 [1] Ylitie, Karras, Laine. Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs.
 HPG 2017.
@@ -19,24 +19,24 @@ import numpy as np
 
 from .heap import ARITY
 
-#: Words of a node, and the largest coordinate of the grid.
+#: The number of words of a node, and the largest coordinate of the grid.
 WORDS, RANGE = 8, 255 * 256
 
 #: The exponent of the unit of bytes that is stored as 0: the unit is 2**(stored + this).
 MIN_EXPONENT = -7
 _MAX_EXPONENT = 8
 
-#: How many nodes are encoded at a time.
+#: The number of nodes encoded at a time.
 _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The grid over a mesh: world space is ``low + point / scale``.
+    """The grid over a mesh: the world space position of a point is ``low + point / scale``.
 
     Attributes:
         low: The lower corner of the mesh. Shape (3,), float32.
-        scale: Units of the grid in one unit of world space. Shape (3,), float32.
+        scale: The number of grid units per unit of world space. Shape (3,), float32.
     """
 
     low: np.ndarray
@@ -45,7 +45,7 @@ class Grid:
     @classmethod
     def over(cls, low: np.ndarray, high: np.ndarray) -> Grid:
         """The grid over a box."""
-        # No axis is much finer than the others: flat meshes have one without extent
+        # No axis is much finer than the others, because flat meshes have an axis without extent
         extent = np.maximum(high.astype(np.float64) - low, 1e-6 * max(np.ptp([low, high]), 1e-30))
         scale = np.nextafter((RANGE / extent).astype(np.float32), np.float32(0))
         return cls(low.astype(np.float32), scale)
@@ -80,7 +80,7 @@ def _encode(children: np.ndarray, grid: Grid) -> np.ndarray:
     corner = np.floor(low.min(axis=2))
     extent = np.where(is_empty, -np.inf, high).max(axis=2) - corner
     exponent = np.ceil(np.log2(np.maximum(extent, 1e-9) / 255))
-    exponent += extent > 255 * np.exp2(exponent)  # where the logarithm was rounded down
+    exponent += extent > 255 * np.exp2(exponent)  # if the logarithm was rounded down
     exponent = np.clip(exponent, MIN_EXPONENT, _MAX_EXPONENT)
     unit = np.exp2(exponent)
     low = np.floor((low - corner[..., None]) / unit[..., None])

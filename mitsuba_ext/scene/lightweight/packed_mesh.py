@@ -1,8 +1,8 @@
-"""A mesh in 16 bytes for each triangle or less, tree included.
+"""A mesh in at most 16 bytes per triangle, including the tree.
 
-Corners are points of a grid, with 16 bits for each coordinate. Triangles name their corners with 16
-bits: each block of triangles has its own table of corners, in which those that it shares with other
-blocks are repeated. Triangles with a common edge compute its ends from the same numbers, so that
+Corners are points of a grid, with 16 bits for each coordinate. Triangles refer to their corners
+with 16-bit indices: each block of triangles has a separate table of corners, and corners shared
+between blocks are repeated. Triangles with a common edge compute its ends from the same numbers, so
 there is no gap between them.
 """
 
@@ -19,10 +19,10 @@ from .interaction import Triangle, surface_interaction
 from .mesh_tree import MeshTree, positions_and_faces
 from .shorts import LARGEST, Pairs, Quantizer, Triples
 
-#: Triangles of a block: so few that 16 bits name all of their corners.
+#: The number of triangles in a block, small enough for 16-bit indices of their corners.
 _BLOCK = 1 << 14
 
-#: How many vertices are decoded at a time.
+#: The number of vertices decoded at a time.
 _CHUNK = 1 << 20
 
 
@@ -30,10 +30,10 @@ class PackedMesh(Lightweight):
     """A mesh with quantized vertices.
 
     Parameters:
-        mesh: The mesh that is packed. It is not kept.
+        mesh: The mesh to pack. It is not kept.
 
     Attributes:
-        nbytes (int): The memory of tree, triangles and vertices.
+        nbytes (int): The memory of the tree, the triangles and the vertices, in bytes.
     """
 
     def __init__(self, mesh: mi.Mesh) -> None:
@@ -107,8 +107,8 @@ def _blocks(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         faces: The vertices of each triangle. Shape (triangles, 3).
 
     Returns:
-        The old numbers of the new vertices; for each triangle, its new ones relative to the first
-        one of its block, as uint16; and that first one for each block.
+        The old indices of the new vertices; for each triangle, its new vertex indices relative to
+        the first vertex of its block, as uint16; and the index of the first vertex of each block.
     """
     vertices, first = [], [0]
     local = np.empty(faces.shape, dtype=np.uint16)
@@ -122,7 +122,7 @@ def _blocks(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _packed_directions(normals: np.ndarray) -> np.ndarray:
-    """Directions as points of a square, in 16 bits each. Shape (normals, 2), uint16."""
+    """Directions as points of a square, with 16 bits per coordinate. Shape (normals, 2), uint16."""
     square = np.array(octahedral(mi.Vector3f(normals.T))).T
     # A vertex without triangles has no normal
     return np.rint((np.nan_to_num(square) + 1) * (LARGEST / 2)).astype(np.uint16)

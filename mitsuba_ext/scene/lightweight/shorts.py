@@ -1,4 +1,4 @@
-"""Tables of 16-bit numbers on the device, two in a word."""
+"""Tables of 16-bit numbers on the device, two per word."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ...util.arrays import from_numpy
 
-#: The largest number of 16 bits.
+#: The largest 16-bit number.
 LARGEST = (1 << 16) - 1
 
 
@@ -36,14 +36,14 @@ class Triples:
     """
 
     def __init__(self, values: np.ndarray) -> None:
-        # One number more than there are, if they are odd
+        # Padded to an even count
         padded = np.zeros(values.size + values.size % 2, dtype="<u2")
         padded[: values.size] = values.ravel()
         self._words = from_numpy(mi.UInt32, padded.view("<u4"))
         self.nbytes = padded.nbytes
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, ...]:
-        # An entry begins in the lower half of a word, or in the upper one
+        # An entry begins in the lower or in the upper half of a word
         first = 3 * index >> 1
         a = dr.gather(mi.UInt32, self._words, first, active)
         b = dr.gather(mi.UInt32, self._words, first + 1, active)

@@ -6,7 +6,7 @@ import numpy as np
 
 _LOW = np.uint64(0xFFFFFFFF)
 
-#: How many columns are numbered at a time.
+#: The number of columns numbered at a time.
 _CHUNK = 1 << 16
 
 
@@ -20,7 +20,7 @@ def separated(values: np.ndarray, left: int) -> np.ndarray:
         Indices of the flattened table. Shape (rows * size,), int64.
     """
     keys = _keys(values)
-    del values  # for one row with all triangles, this is much
+    del values  # a single row with all triangles takes much memory
     keys.partition(left, axis=1)
     return _places(keys)
 
@@ -33,9 +33,9 @@ def sorted_rows(values: np.ndarray) -> np.ndarray:
 
 
 def _keys(values: np.ndarray) -> np.ndarray:
-    """Integers that sort as the values do, with their columns in the lower half."""
+    """Integers that sort like the values, with their columns in the lower half."""
     bits = values.view(np.uint32)
-    # All bits of negative numbers, the sign of others
+    # All bits of negative numbers, the sign bit of others
     flips = bits.view(np.int32) >> 31
     flips |= np.int32(-(1 << 31))
     bits ^= flips.view(np.uint32)

@@ -1,4 +1,4 @@
-"""The upper part of a tree: nodes with four children, which are such nodes again, or treelets.
+"""The upper part of a tree: nodes with four children, each another such node or a treelet.
 
 Nodes and treelets are numbered together: the children of a node are neighbours.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from .boxes import area
-from .division import Division
+from .division import TreeletDivision
 from .heap import ARITY
 
 
@@ -23,10 +23,10 @@ class Top:
         parts: The part of each node or treelet. Shape (numbers,).
         first: The first child of each node; -1 for a treelet.
         children: The parts of the children of each node; -1 beyond the last. Shape (nodes, 4).
-        waiting: How many others may wait on the stack while something is visited.
+        waiting: The maximum number of others on the stack while a node or treelet is visited.
     """
 
-    def __init__(self, division: Division, boxes: np.ndarray) -> None:
+    def __init__(self, division: TreeletDivision, boxes: np.ndarray) -> None:
         areas = area(boxes)
         parts, first, waiting, children = [np.array([0])], [], [np.array([0])], []
         numbers = 1
@@ -46,9 +46,9 @@ class Top:
         self.children, self.waiting = np.concatenate(children), np.concatenate(waiting)
 
 
-def _children(division: Division, areas: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Both halves of each part; then twice, the largest of them that can be split is split. Shape
-    (parts, 4)."""
+def _children(division: TreeletDivision, areas: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """The two halves of each part; twice, the largest of them that can be split is then split.
+    Shape (parts, 4)."""
     children = np.full((len(parts), ARITY), -1)
     children[:, 0], children[:, 1] = division.left[parts], division.left[parts] + 1
     rows = np.arange(len(parts))

@@ -1,5 +1,5 @@
-"""Traverses a tree: nearer children first, with the others on a stack (Cline 2007, section
-3.3.4)."""
+"""Traverses a tree: visits nearer children first and keeps the others on a stack (Cline 2007,
+section 3.3.4)."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-#: No node, no triangle; the key of a child that a ray misses.
+#: Stands for no node or no triangle; also the key of a child that a ray misses.
 NONE = 0xFFFFFFFF
 
-#: The bits of a key that hold a distance; the others number the child.
+#: The bits of a key that hold a distance; the others hold the index of the child.
 _DISTANCE = 0xFFFFFFFC
 
 #: The closest hit so far: its distance, or the end of the ray; its triangle, or ``NONE``; and its
 #: barycentric coordinates.
-Hit = "tuple[mi.Float, mi.UInt32, mi.Point2f]"  # in quotes, as there may be no variant yet
+Hit = "tuple[mi.Float, mi.UInt32, mi.Point2f]"  # in quotes because there may be no variant yet
 
-#: For each child, the distance of its box, not negative, and whether the ray meets it; and the
-#: function that gives the child with a number from 0 to 3.
+#: For each child, the nonnegative distance of its box and whether the ray meets it; and a function
+#: that returns the child with an index from 0 to 3.
 Children = "tuple[list[tuple[mi.Float, mi.Bool]], Callable[[mi.UInt32], mi.UInt32]]"
 
 
 class Tree(Protocol):
-    """What is traversed, for one set of rays."""
+    """A tree as seen by one set of rays."""
 
     #: The root, which is not a leaf.
     root: int
 
-    #: How many children wait at most while others are visited.
+    #: The maximum number of children that wait while others are visited.
     stack_size: int
 
     def is_leaf(self, node: mi.UInt32) -> mi.Bool:
-        """Does ``node`` hold triangles?"""
+        """Whether ``node`` holds triangles."""
 
     def children(self, node: mi.UInt32, maxt: mi.Float) -> Children:
         """The children of an inner node, and which of them rays meet before ``maxt``."""
 
     def intersect(self, leaf: mi.UInt32, hit: Hit) -> Hit:
-        """The closest hit, with those of a leaf."""
+        """The closest of a previous hit and the hits in a leaf."""
 
 
 def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
@@ -47,11 +47,11 @@ def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
     """
 
     def pop(node, size, stack, maxt):
-        """Continues with the latest node on the stack where there is none."""
+        """Takes the latest node from the stack in lanes without a node."""
         pops = (node == NONE) & (size > 0)
         size = dr.select(pops, size - 1, size)
         key, stored = stack.read(size, pops)
-        # What lies behind the closest hit so far is skipped
+        # Skips what lies behind the closest hit so far
         is_near = dr.reinterpret_array(mi.Float, key & _DISTANCE) <= maxt
         return dr.select(pops & is_near, stored, node), size
 
@@ -78,7 +78,7 @@ def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
         return searches, node, size, stack, maxt
 
     def body(active, node, size, stack, hit):
-        # Rays wait at their next leaf for others of their group
+        # Rays wait at their next leaf for the others of their group
         searches = active & dr.select(node == NONE, size > 0, ~tree.is_leaf(node))
         state = (searches, node, size, stack, hit[0])
         _, node, size, stack, _ = dr.while_loop(
@@ -94,7 +94,7 @@ def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
             active &= hit[1] == NONE
         return active, node, size, stack, hit
 
-    # Which triangle is hit does not depend smoothly on anything
+    # The index of the hit triangle is not differentiable
     ray = dr.detach(ray)
     width = dr.width(ray)
     hit = (mi.Float(ray.maxt), dr.full(mi.UInt32, NONE, width), dr.zeros(mi.Point2f, width))

@@ -1,10 +1,10 @@
-"""Intersects rays with triangles, such that no ray passes between two that share an edge or a
-corner.
+"""Intersects rays with triangles such that no ray passes between two triangles that share an edge
+or a corner.
 
 Corners are projected along the ray. The signs of three areas tell whether the projected triangle
 contains the ray. Triangles that share an edge compute its area from the same two points of the
-plane, with opposite signs, whatever is rounded: so the rounded projections cover the plane
-without gaps, as in [1].
+plane, with opposite signs, however these are rounded. The rounded projections therefore cover the
+plane without gaps, as in [1].
 
 [1] Woop, Benthin, Wald. Watertight Ray/Triangle Intersection. Journal of Computer Graphics
 Techniques 2(1), 2013.
@@ -41,7 +41,7 @@ class Projection:
         is_inside = (dr.minimum(dr.minimum(area_a, area_b), area_c) >= 0) | (
             dr.maximum(dr.maximum(area_a, area_b), area_c) <= 0
         )
-        # Zero for a triangle that is seen from its edge: it is not hit, as the distance is NaN
+        # Zero for a triangle that is seen edge on: it is not hit, because the distance is NaN
         scale = dr.rcp(area_a + area_b + area_c)
         uv = mi.Point2f(area_b, area_c) * scale
         z_a, z_b, z_c = (_dot(p, self._z) for p in offsets)
@@ -50,12 +50,12 @@ class Projection:
 
 
 def _dot(p: mi.Vector3f, q: mi.Vector3f) -> mi.Float:
-    # Fused where it is said, so that all triangles round the projection of a corner alike
+    # Explicitly fused, so that all triangles round the projection of a corner alike
     return dr.fma(p.x, q.x, dr.fma(p.y, q.y, p.z * q.z))
 
 
 def _area(p: mi.Point2f, q: mi.Point2f) -> mi.Float:
-    """Four times the area between the origin and an edge. If the ends of the edge change places,
-    its sign changes and nothing else: each rounded product has its counterpart."""
+    """Four times the area between the origin and an edge. If the ends of the edge are swapped, only
+    its sign changes: each rounded product has its counterpart."""
     a, b = p.x * q.y, p.y * q.x
     return dr.fma(p.x, q.y, -b) - dr.fma(p.y, q.x, -a)

@@ -1,1 +1,1 @@
-"""Area lights that are sampled by the solid angle that their shapes subtend."""
+"""Area lights that are sampled by the solid angles of their shapes."""

@@ -9,8 +9,8 @@ import numpy as np
 from ..solid_angles.disk import EllipticalCone, elliptical_cone
 from .surface import Surface, SurfacePoint
 
-#: A disk is round if its axes are equally long and perpendicular, up to this fraction of their
-#: squared length.
+#: The tolerance for a disk with equally long, perpendicular axes, as a fraction of their squared
+#: length.
 _TOLERANCE = 1e-4
 
 
@@ -49,9 +49,9 @@ class DiskSurface(Surface):
 
 
 def is_round(shape: mi.Shape) -> bool:
-    """Is a disk a circle, and not an ellipse?"""
+    """Whether a disk is a circle rather than an ellipse."""
     matrix = mi.traverse(shape)["to_world"].matrix
-    # Number by number: a matrix cannot be read while Dr.Jit records a call
+    # Element by element, because a matrix cannot be read while Dr.Jit records a call
     x, y = (np.array([matrix[i, j].numpy()[0] for i in range(3)]) for j in range(2))
     square = x @ x
     return abs(y @ y - square) < _TOLERANCE * square and abs(x @ y) < _TOLERANCE * square

@@ -19,14 +19,14 @@ class Intensities:
     Attributes:
         values: Shape [horizontal, vertical]: horizontal angles from 0° to 360°, both included, or a
             single row if the intensity does not depend on them; vertical angles from 0° (straight
-            ahead) to 90°. Regular steps.
+            ahead) to 90°. Steps are regular.
     """
 
     values: np.ndarray
 
 
 def read_ies(file: Path) -> Intensities:
-    """Reads a photometric file of type C, the type of almost all luminaires.
+    """Reads a photometric file of type C, which almost all luminaires use.
 
     Raises:
         ValueError: The file is damaged or of another type, or the luminaire does not shine into its
@@ -35,7 +35,7 @@ def read_ies(file: Path) -> Intensities:
     text = file.read_text(encoding="latin-1")
     parts = re.split(r"^TILT *= *(\S+).*$", text, maxsplit=1, flags=re.MULTILINE)
     if len(parts) != 3:
-        raise ValueError(f"{file}: no photometric file (IES LM-63): it has no line TILT=")
+        raise ValueError(f"{file}: not a photometric file (IES LM-63): it has no line TILT=")
     try:
         numbers = np.array(parts[2].replace(",", " ").split(), dtype=np.float64)
         if parts[1] == "INCLUDE":
@@ -58,7 +58,7 @@ def read_ies(file: Path) -> Intensities:
     table /= table.max()
     if len(horizontal) == 1:
         return Intensities(table)
-    # Files give a quarter or half of the circle if the rest is symmetric
+    # Files give a quarter or a half of the circle if the rest is symmetric
     turn = _HORIZONTAL.copy()
     if horizontal[-1] <= 180:
         turn = np.minimum(turn, 360 - turn)

@@ -1,4 +1,4 @@
-"""Sampling meshes of few triangles by solid angle."""
+"""Sampling meshes with few triangles by solid angle."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from ...util.arrays import from_numpy
 from ..solid_angles.spherical_triangle import SphericalTriangle, spherical_triangle
 from .surface import Surface, SurfacePoint
 
-#: Meshes with more triangles are not sampled by solid angle: each sample visits all triangles.
+#: The maximum number of triangles of a mesh that is sampled by solid angle: each sample visits all
+#: triangles.
 MOST_TRIANGLES = 16
 
-#: Floats of a triangle in the table: a corner, two edges, a sign; and three normals.
+#: The number of floats per triangle in the table: a corner, two edges, a sign, and three normals.
 _WORDS = 20
 
 
 class MeshSurface(Surface):
-    """A mesh, sampled by the solid angle of those of its triangles that face the point.
+    """A mesh, sampled by the solid angle of its triangles that face the point.
 
     A triangle is chosen in proportion to its solid angle. All directions to triangles then have the
-    same density, and :meth:`pdf` does not depend on the triangle. Where triangles hide each other,
+    same density, and :meth:`pdf` does not depend on the triangle. If triangles hide each other,
     some samples are occluded.
     """
 
@@ -43,8 +44,8 @@ class MeshSurface(Surface):
         a = b + ba
         triangle = spherical_triangle(a, b, a + ac, ba, ac)
         if self._is_smooth:
-            # Light leaves where the interpolated normal faces the point. There is no such place if
-            # none of the three normals faces the point from any of the three corners
+            # Light leaves where the interpolated normal faces the point: nowhere if none of the
+            # three normals faces the point from any of the three corners
             normals = (mi.Vector3f(row[i], row[i + 1], row[i + 2]) for i in (10, 13, 16))
             faces = mi.Bool(False)
             for normal in normals:
@@ -56,7 +57,7 @@ class MeshSurface(Surface):
         return triangle
 
     def _sums(self, p: mi.Point3f) -> list[mi.Float]:
-        """Half of the solid angle of the first triangle, of the first two, and so on."""
+        """Half the solid angle of the first triangle, of the first two, and so on."""
         sums = []
         for index in range(self._count):
             half_angle = self._triangle(mi.UInt32(index), p, mi.Bool(True)).half_angle
@@ -68,7 +69,7 @@ class MeshSurface(Surface):
         sums = self._sums(p)
         total = sums[-1]
         target = sample.x * total
-        # The first triangle with which the sum exceeds the target
+        # Finds the first triangle whose running sum exceeds the target
         chosen, before = mi.UInt32(0), mi.Float(0)
         for sum in sums[:-1]:
             is_passed = (sum <= target) & (sum < total)

@@ -8,8 +8,8 @@ import mitsuba as mi
 from ...util.arrays import from_numpy
 from .ies import Intensities
 
-#: Radiance is intensity divided by the projected area of the light. The projected area is taken to
-#: be at least this fraction of the area, since real luminaires are not flat.
+#: The minimum ratio of the light's projected area to its area: radiance is intensity divided by the
+#: projected area, and real luminaires are not flat.
 LEAST_COSINE = 0.1
 
 
@@ -17,7 +17,7 @@ class Profile:
     """A direction-dependent factor of the radiance.
 
     Attributes:
-        needs_axis: Does the profile change if the light is rotated about its normal?
+        needs_axis: Whether the profile changes if the light is rotated about its normal.
     """
 
     needs_axis = False

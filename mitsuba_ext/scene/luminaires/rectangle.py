@@ -1,4 +1,4 @@
-"""Sampling rectangles, which may be sheared to parallelograms, by solid angle."""
+"""Sampling rectangles, possibly sheared to parallelograms, by solid angle."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..solid_angles.projected_polygon import ProjectedPolygon
 from ..solid_angles.spherical_polygon import SphericalPolygon, spherical_polygon
 from .surface import Surface, SurfacePoint
 
-#: With projected solid angle sampling, the fraction of samples that are taken by solid angle.
-_SHARE = 0.1
+#: The fraction of samples taken by solid angle in projected solid angle sampling.
+_DIRECT_FRACTION = 0.1
 
-#: Lights with a smaller projected solid angle are sampled by their solid angle, since the sum over
+#: The minimum projected solid angle of a light for sampling by it: for smaller lights, the sum over
 #: their edges would be inexact.
-_LEAST_AREA = 1e-3
+_MIN_AREA = 1e-3
 
 
 class RectangleSurface(Surface):
@@ -45,7 +45,7 @@ class RectangleSurface(Surface):
         return _reciprocal(self._seen_from(it.p).solid_angle)
 
     def _uv(self, polygon: SphericalPolygon, sample: mi.Point2f) -> mi.Point2f:
-        """The point that is uniformly distributed by solid angle, as coordinates ``uv``."""
+        """A point that is uniformly distributed by solid angle, as coordinates ``uv``."""
         index, a, b = polygon.sample(sample)
         # The corners of the two triangles are 1 and 2, and 2 and 3
         is_first = index == 0
@@ -62,9 +62,9 @@ class RectangleSurface(Surface):
 
 class ProjectedRectangleSurface(RectangleSurface):
     """A rectangle, sampled by its projected solid angle: in proportion to the cosine with the
-    receiver's normal. A fraction of the samples is taken by solid angle instead. It bounds the
-    weights for receivers that scatter light even where this cosine is 0 (shading normals,
-    transmission). The side of the receiver that scatters the light is not known: directions below
+    receiver's normal. A fraction of the samples is taken by solid angle instead. These bound the
+    weights at receivers that scatter light even where this cosine is 0 (shading normals,
+    transmission). The side of the receiver that scatters the light is unknown, so directions below
     the horizon are sampled too, by the absolute value of the cosine.
 
     Small lights are sampled by solid angle, and so are all lights at receivers without a normal."""
@@ -73,11 +73,11 @@ class ProjectedRectangleSurface(RectangleSurface):
         polygon = self._seen_from(it.p)
         sides = self._sides(it, polygon)
         area = sides.above.area + sides.below.area
-        is_projected = area > _LEAST_AREA
-        x = (sample.x - _SHARE) / (1 - _SHARE)
+        is_projected = area > _MIN_AREA
+        x = (sample.x - _DIRECT_FRACTION) / (1 - _DIRECT_FRACTION)
         # ----- By solid angle -----
         is_direct = ~is_projected | (x < 0)
-        rest = dr.select(is_projected, sample.x / _SHARE, sample.x)
+        rest = dr.select(is_projected, sample.x / _DIRECT_FRACTION, sample.x)
         uv = self._uv(polygon, mi.Point2f(dr.minimum(rest, 1), sample.y))
         # ----- By projected solid angle: the part above or below the horizon -----
         above = sides.above.area / dr.maximum(area, 1e-37)
@@ -116,10 +116,10 @@ class ProjectedRectangleSurface(RectangleSurface):
         self, sides: _Sides, polygon: SphericalPolygon, it: mi.Interaction3f, d: mi.Vector3f
     ) -> mi.Float:
         area = sides.above.area + sides.below.area
-        is_projected = area > _LEAST_AREA
+        is_projected = area > _MIN_AREA
         cosine = dr.abs(dr.dot(d, it.n)) * dr.rsqrt(dr.maximum(dr.squared_norm(d), 1e-37))
         by_angle = _reciprocal(polygon.solid_angle)
-        mixed = dr.lerp(cosine / dr.select(is_projected, area, 1), by_angle, _SHARE)
+        mixed = dr.lerp(cosine / dr.select(is_projected, area, 1), by_angle, _DIRECT_FRACTION)
         return dr.select(is_projected, mixed, by_angle)
 
     def _hit(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Point2f:
@@ -138,7 +138,7 @@ class ProjectedRectangleSurface(RectangleSurface):
 
 
 def _column(matrix: mi.Matrix4f, index: int) -> np.ndarray:
-    # Number by number: a matrix cannot be read while Dr.Jit records a call
+    # Element by element, because a matrix cannot be read while Dr.Jit records a call
     return np.array([float(matrix[i, index][0]) for i in range(3)])
 
 

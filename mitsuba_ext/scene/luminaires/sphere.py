@@ -8,8 +8,8 @@ import mitsuba as mi
 from ..solid_angles.cone import Cone, cone
 from .surface import Surface, SurfacePoint, per_solid_angle
 
-#: Points on the surface of a sphere that shines inwards may lie outside of it by this fraction of
-#: the radius, because of rounding.
+#: The fraction of the radius by which points on the surface of a sphere that shines inwards may lie
+#: outside it because of rounding.
 _ROUNDING = 1e-5
 
 
@@ -55,7 +55,7 @@ class SphereSurface(Surface):
         return pdf
 
     def sample_area(self, sample, active):
-        # Not by the shape's method, which does not rotate normals with the sphere
+        # Not with the shape's method, which does not rotate normals with the sphere
         normal = mi.warp.square_to_uniform_sphere(sample)
         return SurfacePoint(self._point(normal, active), dr.rcp(self.area()))
 

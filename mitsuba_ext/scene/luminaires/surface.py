@@ -14,7 +14,7 @@ class SurfacePoint:
 
     Attributes:
         si: The interaction at the point; ``wi`` is not set.
-        pdf: The density with which it was sampled: per solid angle, or per area.
+        pdf: The density with which the point was sampled, per solid angle or per area.
     """
 
     si: mi.SurfaceInteraction3f
@@ -40,8 +40,7 @@ class Surface:
         return point
 
     def pdf(self, it: mi.Interaction3f, ds: mi.DirectionSample3f) -> mi.Float:
-        """The density, per solid angle, with which :meth:`sample` at ``it`` samples the point of
-        ``ds``."""
+        """The density, per solid angle, of the point of ``ds`` under :meth:`sample` at ``it``."""
         return per_solid_angle(dr.rcp(self.area()), ds.d * ds.dist, ds.n)
 
     def sample_area(self, sample: mi.Point2f, active: mi.Bool) -> SurfacePoint:
@@ -61,7 +60,7 @@ class Surface:
         pi.prim_uv, pi.prim_index = prim_uv, prim_index
         pi.t, pi.valid = dr.select(active, mi.Float(0), dr.inf), mi.Bool(active)
         ray = dr.zeros(mi.Ray3f, dr.width(p))
-        # The result does not depend on the direction, except ``wi``, which callers replace
+        # Only ``wi`` depends on the direction, and callers replace it
         ray.o, ray.d = p, mi.Vector3f(0, 0, 1)
         si = self.shape.compute_surface_interaction(ray, pi, mi.RayFlags.All, active)
         si.sh_frame = mi.Frame3f(si.sh_frame.n)

@@ -1,4 +1,4 @@
-"""The choice of the sampling method for each kind of shape."""
+"""Chooses the sampling method for each kind of shape."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def surface(name: str, shape: mi.Shape | None, is_projected: bool = False) -> Su
     Parameters:
         name: Name of the light's plugin, for errors.
         shape: The shape of the light.
-        is_projected: Sample by projected solid angle?
+        is_projected: Whether to sample by projected solid angle.
 
     Raises:
         NotImplementedError: Shapes of this kind cannot be sampled by (projected) solid angle.

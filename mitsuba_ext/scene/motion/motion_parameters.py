@@ -15,12 +15,12 @@ from .rigid_motion import Motion
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Largest deviation of a pose from a rigid one: matrices in text files are rounded.
+#: The maximum deviation of a pose from a rigid one: matrices in text files are rounded.
 _RIGID_TOLERANCE = 1e-4
 
 
 def read_motion(plugin: str, props: mi.Properties) -> Motion:
-    """The motion that the parameters of a plugin describe.
+    """Reads the motion that the parameters of a plugin describe.
 
     Parameters:
         plugin: Name of the plugin, for errors.

@@ -2,8 +2,8 @@
 
 A motion maps a point p of the *rest frame* to R(t) · (p − center) + position(t). It is a sequence
 of segments. During each, the position moves at constant velocity, and the rotation has a constant
-angular velocity about an axis that is fixed in the world. Before the first segment and after the
-last one, there is no motion.
+angular velocity about an axis that is fixed in the world. There is no motion before the first
+segment or after the last one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from ...util.arrays import from_numpy
 
-#: The largest angle, and the largest number, of the steps in which the bounds of a rotation are
+#: The maximum angle and the maximum number of the steps in which the bounds of a rotation are
 #: computed.
 _BOUNDS_STEP = math.radians(3)
-_MOST_BOUNDS_STEPS = 4096
+_MAX_BOUNDS_STEPS = 4096
 
 #: The number of 4-vectors that describe a segment on the device.
 _ROW = 5
@@ -38,7 +38,7 @@ class Motion:
         starts: Rotations at the start of the segments, as quaternions (x, y, z, w): [S, 4].
         turns: Rotation vectors of the segments (axis times angle in radians, which may exceed a
             full turn): [S, 3].
-        center: The point of the rest frame about which it turns: [3].
+        center: The point of the rest frame about which rotations turn: [3].
     """
 
     times: np.ndarray
@@ -92,12 +92,12 @@ class Motion:
         times.
 
         Returns:
-            Its least and its greatest corner.
+            Its lower and its upper corner.
         """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for k, turn in enumerate(self.turns):
             angle = np.linalg.norm(turn)
-            steps = int(np.clip(math.ceil(angle / _BOUNDS_STEP), 1, _MOST_BOUNDS_STEPS))
+            steps = int(np.clip(math.ceil(angle / _BOUNDS_STEP), 1, _MAX_BOUNDS_STEPS))
             moved = np.stack(
                 [self._move_in_segment(corners, k, i / steps) for i in range(steps + 1)]
             )
@@ -140,7 +140,7 @@ class Pose:
         return _moved(ray, self.point_to_rest, self.rotation.T)
 
     def ray_to_world(self, ray: mi.Ray3f) -> mi.Ray3f:
-        """The ray of the rest frame, and its differentials if it has them, in the world."""
+        """The ray of the rest frame, with its differentials if it has them, in the world."""
         return _moved(ray, self.point_to_world, self.rotation)
 
     def point_to_rest(self, p: mi.Point3f) -> mi.Point3f:

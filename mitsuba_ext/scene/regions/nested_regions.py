@@ -1,4 +1,4 @@
-"""Regions of surfaces, finer where more of the given points lie."""
+"""Regions of surfaces that are smaller where there are more points."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from ...util.stored_arrays import StoredArrays
 from .surface_sides import region
 from .voxel_sides import SIDES, VoxelSides, voxel_coordinates
 
-#: Voxels along each axis, level by level: the voxels of a level divide those of the level before.
+#: The number of voxels along each axis at each level. Voxels divide the voxels of the previous
+#: level.
 _GRIDS = (4, 8, 16, 32)
 
 
 class NestedRegions:
-    """Regions are pairs of a voxel of the box in which the given points lie and a side of its
+    """Regions are pairs of a voxel, in the bounding box of the given points, and a side of its
     surfaces.
 
-    Region 0 is the whole scene. Regions of large voxels follow, then those of the smaller voxels
-    inside of them; a region exists only where there are enough points. A point belongs to the
-    smallest region that contains it.
+    Region 0 is the whole scene. Regions of large voxels follow, then regions of the smaller voxels
+    inside them; a region exists only if it contains enough points. A point belongs to the smallest
+    region that contains it.
 
     Parameters:
-        p, n: Points, and normals on the side that is lit; not empty.
-        least: The least number of these points in a region.
-        most: The most regions; where there would be more, ``least`` is raised.
+        p, n: Points, and normals on the lit side; not empty.
+        least: The minimum number of these points in a region.
+        most: The maximum number of regions; if there would be more, ``least`` is raised.
 
     Attributes:
         count (int): Number of regions.
         levels (list[slice]): The regions of each level.
-        parent (np.ndarray): The region of the level before, or of an earlier one, that contains
-            each region; shape [regions].
+        parent (np.ndarray): For each region, the containing region of the previous or an earlier
+            level; shape [regions].
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class NestedRegions:
         dr.eval(self._table)
 
     def state(self) -> dict[str, np.ndarray]:
-        """What :meth:`number` needs, as arrays."""
+        """The data that :meth:`number` needs, as arrays."""
         return {
             "origin": self._origin,
             "scale": self._scale,
@@ -84,12 +85,12 @@ class NestedRegions:
         """Regions from a :meth:`state`, with only :meth:`number` and ``count``.
 
         Raises:
-            DamagedError: The state is that of no regions.
+            DamagedError: The state is not a state of regions.
         """
         regions, pairs = cls.__new__(cls), _GRIDS[-1] ** 3 * SIDES
         regions._origin = state.take("origin", "f", (3,))
         regions._scale = state.take("scale", "f", (3,), least=0)
-        # At most a region for each pair of each grid, and the whole scene
+        # At most one region for each pair of each grid, and the whole scene
         regions.count = state.number("count", "iu", 1, 1 + sum(n**3 * SIDES for n in _GRIDS))
         table = state.take("table", "u", (pairs,), most=regions.count - 1)
         regions._pairs = VoxelSides(

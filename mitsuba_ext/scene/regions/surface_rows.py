@@ -1,4 +1,4 @@
-"""The rows of tables that are learned for surfaces: a voxel, and the side from which it is lit."""
+"""The rows of tables that are learned for surfaces: pairs of a voxel and a lit side."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from ...util.arrays import from_numpy
 from .surface_sides import lit_normal
 from .voxel_sides import SIDES, VoxelSides, sides, voxel_coordinates, voxel_number
 
-#: Bytes of the table of rows for each voxel of the region.
+#: The size of the table of rows, in bytes per voxel of the region.
 BYTES_PER_VOXEL = 4 * SIDES
 
 
 class SurfaceRows:
     """Numbers, without gaps, the pairs of a voxel and a side (:class:`VoxelSides`) in which
-    vertices were found. Each pair is a row of the tables: the two sides of a thin wall, and the
-    floor and the wall in a corner, are lit by different lights.
+    vertices were found. Each pair is a row of the tables, because the two sides of a thin wall, or
+    the floor and the wall in a corner, are lit by different lights.
 
     Parameters:
         bbox: The box that is divided into voxels.
         resolution: Voxels along each axis.
-        p, n: Vertices, and normals on the side that is lit. At least one vertex lies in ``bbox``.
+        p, n: Vertices, and normals on the lit side. At least one vertex lies in ``bbox``.
 
     Attributes:
         count (int): Number of rows; the last one stands for all other points.
-        pairs (mi.UInt32): The pair of each other row, as 6 · voxel + side; shape [count − 1].
-        first, size (mi.UInt32): The vertices of a row are those from ``first`` to
-            ``first + size − 1`` in ``p`` and ``n``; shape [count − 1].
-        p, n: The vertices inside of ``bbox``, row by row.
+        pairs (mi.UInt32): The pair of each row except the last, as 6 · voxel + side; shape [count −
+            1].
+        first, size (mi.UInt32): The vertices of a row have the indices ``first`` to ``first + size
+            − 1`` in ``p`` and ``n``; shape [count − 1].
+        p, n: The vertices inside ``bbox``, row by row.
     """
 
     def __init__(
@@ -37,7 +38,7 @@ class SurfaceRows:
     ) -> None:
         self.bbox, self.resolution = bbox, resolution
         scale = 1 / voxel_edges(bbox, resolution)
-        # Opaque: other scenes and sensors share the kernels
+        # Opaque so that other scenes and sensors share the kernels
         self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, dr.opaque(mi.Int32, resolution))
         pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
         pair_count = resolution**3 * SIDES
@@ -57,13 +58,13 @@ class SurfaceRows:
         dr.eval(self.p, self.n, self._row)
 
     def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """The row of a surface point, on the side that it is seen from."""
+        """The row of a surface point on the side from which it is seen."""
         pair, inside = self._pairs.number(si.p, lit_normal(si), active)
         return dr.select(inside, dr.gather(mi.UInt32, self._row, pair, inside), self._last)
 
     def coarse(self) -> tuple[mi.UInt32, int]:
-        """For each row but the last, the number of the row of a grid of half the resolution that it
-        is a part of, and how many such rows there are."""
+        """For each row except the last, the index of the row of a grid with half the resolution
+        that contains it; and the number of such coarse rows."""
         half = (self.resolution + 1) // 2
         x, y, z = voxel_coordinates(self.pairs // SIDES, self.resolution)
         voxel = voxel_number(x // 2, y // 2, z // 2, half)

@@ -6,19 +6,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Share of the vertices that may lie outside of the region, on either side of each axis.
-_OUTSIDE = 2e-3
+#: The maximum fraction of vertices outside the region, on either side of each axis.
+_MAX_OUTSIDE = 2e-3
 
-#: Margin of the region on each side, in units of its size.
+#: The margin of the region on each side, in units of its size.
 _MARGIN = 0.02
 
 
 def region(p: mi.Point3f) -> mi.ScalarBoundingBox3f:
-    """A box that holds nearly all of the points. A few distant ones are left out: they would make
+    """A box that holds nearly all points. A few distant ones are left out because they would make
     the voxels of the box coarse."""
     points = p.numpy()
-    low, high = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=1)
-    # A flat region still has some depth, and distant coordinates are rounded
+    low, high = np.quantile(points, [_MAX_OUTSIDE, 1 - _MAX_OUTSIDE], axis=1)
+    # A flat region needs some depth, and distant coordinates are rounded
     size = max((high - low).max(), 1e-4 * np.abs(points).max(), 1e-30)
     margin = _MARGIN * (high - low) + 1e-3 * size
     return mi.ScalarBoundingBox3f(low - margin, high + margin)

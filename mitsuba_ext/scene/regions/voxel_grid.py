@@ -1,4 +1,4 @@
-"""A uniform grid over the scene's bounding box, and which of its voxels hold geometry."""
+"""A uniform grid over the scene's bounding box, with the voxels that hold geometry."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from .voxel_sides import voxel_at, voxel_coordinates, voxel_number
 #: The index of an empty voxel.
 EMPTY = 0xFFFFFFFF
 
-#: Geometry that touches a voxel's face within this share of its size belongs to both neighbours:
-#: the hit points of a wall in that plane are rounded to either side.
+#: The distance to a voxel's face, as a fraction of the voxel's size, within which geometry belongs
+#: to both neighbours: the hit points of a wall in that plane are rounded to either side.
 _MARGIN = 1e-3
 
 
@@ -28,8 +28,8 @@ class VoxelGrid:
         ValueError: The scene has no bounding box.
 
     Attributes:
-        occupied_count (int): Voxels that hold geometry.
-        occupied (mi.UInt32): Their numbers in the full grid; shape [occupied_count].
+        occupied_count (int): The number of voxels that hold geometry.
+        occupied (mi.UInt32): Their indices in the full grid; shape [occupied_count].
     """
 
     def __init__(self, scene: mi.Scene, resolution: int) -> None:
@@ -38,7 +38,8 @@ class VoxelGrid:
         if not bbox.valid():
             raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min
-        # Voxels of a flat scene get some depth, and no point lies on the outer faces of the grid
+        # Gives the voxels of a flat scene some depth, and keeps points off the outer faces of the
+        # grid
         padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)
@@ -63,7 +64,7 @@ class VoxelGrid:
         dr.eval(self._index)
 
     def index(self, p: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        """The number of the occupied voxel that holds ``p``, and whether there is one."""
+        """The index of the occupied voxel that holds ``p``, and whether there is one."""
         voxel, inside = voxel_at(self._relative(p), self.resolution, active)
         index = dr.gather(mi.UInt32, self._index, mi.UInt32(voxel), inside)
         return index, inside & (index != EMPTY)
@@ -86,8 +87,9 @@ class VoxelGrid:
         _mark(is_occupied, dr.opaque(mi.Int32, self.resolution), first, last, a, normal, inside)
 
     def _mark_boxes(self, is_occupied: mi.UInt32, boxes: list[mi.ScalarBoundingBox3f]) -> None:
-        """Shapes that are not meshes occupy their bounding boxes. A lane for each layer of each
-        box, in one launch for all: corners are data, not literals of a kernel."""
+        """Shapes that are not meshes occupy their bounding boxes. One launch handles all boxes,
+        with a lane for each layer of each box, so that corners are data instead of literals in a
+        kernel."""
         if not boxes:
             return
         low, high = (
@@ -119,7 +121,7 @@ class VoxelGrid:
         return dr.clip(first, 0, top), dr.clip(last, 0, top), inside
 
     def _relative(self, p: mi.Point3f) -> mi.Point3f:
-        """In units of voxels from the grid's origin."""
+        """A point in units of voxels from the grid's origin."""
         return (p - self.origin) * self._scale
 
 
@@ -127,10 +129,10 @@ class VoxelGrid:
 def _mark(is_occupied, resolution, first, last, p, normal, active):
     """Marks the voxels from ``first`` to ``last`` that the plane through ``p`` crosses.
 
-    For the voxels around a triangle and the triangle's plane that is the triangle's voxelisation,
-    up to voxels at its edges; a zero normal marks the whole box.
+    With the voxels around a triangle and the triangle's plane, this voxelises the triangle, except
+    for voxels at its edges; a zero normal marks the whole box.
     """
-    # Largest distance of a voxel's centre from a plane that crosses it, times |normal|
+    # The largest distance of a voxel's centre from a plane that crosses it, times |normal|
     reach = (0.5 + _MARGIN) * dr.sum(dr.abs(normal))
     cell = mi.Vector3i(first)
     while active:

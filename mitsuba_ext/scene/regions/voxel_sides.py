@@ -1,4 +1,4 @@
-"""How voxels, and the sides of the surfaces in them, are numbered."""
+"""The numbering of voxels and of the sides of the surfaces in them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: The positive and the negative direction of each axis.
+#: The number of sides: the positive and the negative direction of each axis.
 SIDES = 6
 
 
@@ -20,24 +20,24 @@ class VoxelSides:
     voxel have different sides, and so do the floor and the wall in a corner.
 
     Parameters:
-        origin: The least corner of the box that is divided into voxels.
+        origin: The lower corner of the box that is divided into voxels.
         scale: Voxels per unit of length along each axis.
-        resolution: Voxels along each axis: a number that is compiled into the kernels, or an opaque
-            ``mi.Int32`` where kernels are shared by several resolutions.
+        resolution: Voxels along each axis: an integer that is compiled into the kernels, or an
+            opaque ``mi.Int32`` if several resolutions share kernels.
     """
 
     def __init__(
         self, origin: mi.Point3f, scale: mi.Vector3f, resolution: int | mi.Int32
     ) -> None:
         self._origin, self._scale, self._resolution = origin, scale, resolution
-        # Opaque: other scenes and sensors share the kernels
+        # Opaque so that other scenes and sensors share the kernels
         dr.make_opaque(self._origin, self._scale)
 
     def number(
         self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Bool]:
         """The number of the voxel and the side of points with normals, and whether the points are
-        ``active`` and in the box; the number has no meaning where they are not."""
+        ``active`` and in the box; otherwise, the number has no meaning."""
         voxel, inside = voxel_at((p - self._origin) * self._scale, self._resolution, active)
         return mi.UInt32(voxel) * SIDES + _side(n), inside
 

@@ -1,2 +1,2 @@
-"""Solid angles of shapes seen from a point, and maps of the unit square to directions in them. No
+"""Solid angles of shapes seen from a point, and maps from the unit square to directions in them. No
 module here depends on a scene."""

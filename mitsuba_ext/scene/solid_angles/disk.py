@@ -1,10 +1,10 @@
 """The elliptical cone that a disk subtends at a point.
 
 An exactly area-preserving map needs elliptic integrals (I. Guillén et al., *Area-Preserving
-Parameterizations for Spherical Ellipses*, 2017). The map here has a closed form instead. The
-distance from the axis of the cone is distributed exactly. The angle about the axis has a
-distribution that can be inverted, and that differs from the exact one by a factor between 1 and
-1.21, wherever the point lies. The density is known, and the weights of samples are bounded.
+Parameterizations for Spherical Ellipses*, 2017). This map has a closed form instead. The distance
+from the axis of the cone is distributed exactly. The angle about the axis has a distribution that
+can be inverted, and that differs from the exact one by a factor between 1 and 1.21 for all points.
+The density is known, and the weights of samples are bounded.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class EllipticalCone:
     Attributes:
         frame: The axes x and y of the ellipse, and the axis of the cone.
         tan_x, tan_y: Half-axes of the ellipse; tan_x ≤ tan_y.
-        radius: Radius of the disk. The lengths below are in units of it.
-        along, height: Vector from the origin to the point where the axis meets the disk: component
-            in the plane of the disk (along ``side``), and component perpendicular to it.
+        radius: Radius of the disk, which is the unit of the lengths below.
+        along, height: The components, in the plane of the disk (along ``side``) and perpendicular
+            to it, of the vector from the origin to the point where the axis meets the disk.
         shift: Distance from the centre of the disk to this point, along ``side``.
         side: Unit vector in the plane of the disk that points away from the origin.
     """
@@ -59,7 +59,7 @@ class EllipticalCone:
         versine = r_2 * k / f
         ρ = dr.sqrt(r_2 * (2 - versine) / f) / dr.maximum(1 - versine, dr.rsqrt(1 + k))
         x, y = self.tan_x * ρ * cosine, self.tan_y * ρ * sine
-        # ----- The point where the ray hits the disk, relative to that of the axis -----
+        # ----- The point where the ray hits the disk, relative to the point on the axis -----
         # Without division by the height: this is exact also for a distant disk seen edge on
         distance_2 = dr.square(self.along) + dr.square(self.height)
         to_plane = dr.maximum(self.height - x * self.along, 1e-37)
@@ -69,8 +69,8 @@ class EllipticalCone:
         return (x_disk * self.side + y_disk * self.frame.t) * (self.radius / outside)
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
-        """The density, per solid angle, with which :meth:`sample` samples the direction ``d`` in
-        the cone. The vector may have any length."""
+        """The density, per solid angle, of the direction ``d`` in the cone under :meth:`sample`.
+        The vector may have any length."""
         local = self.frame.to_local(d)
         # cos²φ and sin²φ, up to a factor
         x_2, y_2 = dr.square(local.x * self.tan_y), dr.square(local.y * self.tan_x)

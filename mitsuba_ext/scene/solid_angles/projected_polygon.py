@@ -1,4 +1,5 @@
-"""Convex polygons, sampled by projected solid angle: by the cosine with a receiver's normal.
+"""Convex polygons, sampled by projected solid angle: in proportion to the cosine with a receiver's
+normal.
 
 The Nusselt analog: the polygon's part of the unit sphere, projected on the plane of the receiver,
 is a region of the unit disk. Projected solid angle sampling chooses a uniform point of this region
@@ -19,8 +20,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: Largest number of steps of Newton's method, each kept inside a bracket, and the accepted error
-#: as a fraction of the area: the rounding error of single precision.
+#: The maximum number of steps of Newton's method, each kept inside a bracket, and the tolerated
+#: error as a fraction of the area: the rounding error of single precision.
 _STEPS, _TOLERANCE = 9, 3e-7
 
 _TINY = 1e-30
@@ -32,7 +33,7 @@ class _Edge:
 
     Attributes:
         start, end: Its ends, unit vectors.
-        normal: Normal of its plane; the edge turns counterclockwise about it, from start to end.
+        normal: Normal of its plane, about which the edge turns counterclockwise from start to end.
         length: The angle between its ends; 0 if it lies below the horizon.
     """
 
@@ -86,7 +87,7 @@ class ProjectedPolygon:
         horizon = _Edge(leave, enter, mi.Vector3f(0, 0, turn), _angle(leave, enter))
         self._edges.append(horizon)
         total += turn * horizon.length
-        # Polygons that are seen from behind are clockwise
+        # Polygons seen from behind are clockwise
         self._turn = dr.select(total < 0, mi.Float(-1), 1)
         for normal in normals:
             self._holds_pole &= self._turn * normal.z > 0
@@ -137,8 +138,8 @@ class _Arc:
         end: Its end with the lower azimuth.
         across: Vector in its plane, perpendicular to ``end``, towards the other end.
         normal: Normal of its plane, with a positive z.
-        weight: ± the z component of the normal: positive for edges that are far from the pole,
-            negative for near edges.
+        weight: ± the z component of the normal: positive for edges far from the pole, negative for
+            near edges.
     """
 
     low: mi.Float

@@ -34,7 +34,7 @@ class SphericalPolygon:
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Samples a point of the polygon, uniformly by solid angle. Returns the index k - 1 of its
-        triangle, and the weights of the corners k and k + 1 (that of corner 0 is the rest).
+        triangle, and the weights of the corners k and k + 1 (corner 0 has the rest).
 
         The map is continuous: ``sample.x`` moves the end of an arc from corner 0 along the other
         edges of the polygon, and ``sample.y`` moves along the arc."""
@@ -60,7 +60,7 @@ def spherical_polygon(corners: list[mi.Vector3f], edges: list[mi.Vector3f]) -> S
 
     Parameters:
         corners: Three or more, in a plane.
-        edges: Vectors from each corner to the next one, which must be exact also if the polygon is
+        edges: Vectors from each corner to the next one, which must be exact even if the polygon is
             distant.
     """
     triangles, diagonal = [], edges[0]

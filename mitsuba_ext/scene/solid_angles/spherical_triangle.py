@@ -1,9 +1,10 @@
-"""Spherical triangles: their solid angle, and an area-preserving map of the unit square to them.
+"""Spherical triangles: their solid angle, and an area-preserving map from the unit square.
 
-The map is that of J. Arvo, *Stratified Sampling of Spherical Triangles*, 1995 (course, 4.3), in the
+The map is from J. Arvo, *Stratified Sampling of Spherical Triangles*, 1995 (course, 4.3), in the
 form of C. Peters, *BRDF Importance Sampling for Polygonal Lights*, 2021, which needs no angles of
-the triangle. Where those papers subtract almost equal numbers, the difference is computed here from
-the edges of the triangle. The map is therefore exact for arbitrarily small and distant triangles.
+the triangle. Instead of subtracting almost equal numbers as in these papers, differences are
+computed from the edges of the triangle. The map is therefore exact for arbitrarily small and
+distant triangles.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: A lower bound of divisors: larger than 0, and smaller than all divisors of valid triangles.
+#: The minimum of divisors: larger than 0, and smaller than all divisors of valid triangles.
 _TINY = 1e-37
 
 
 @dataclass
 class SphericalTriangle:
-    """A flat triangle, seen from the origin. Its lengths are in units of the distance of its
+    """A flat triangle, seen from the origin. Its lengths are in units of the distance to its
     farthest corner.
 
     Attributes:
         a, b, c: Its corners.
-        ba, ac: Its edges b → a and a → c. They are stored, since the difference of two corners is
+        ba, ac: Its edges b → a and a → c. They are stored because the difference of two corners is
             inexact if the triangle is small and distant.
         lengths: Distances of the three corners.
         volume: Determinant of the directions to the corners, not negative.
@@ -48,13 +49,13 @@ class SphericalTriangle:
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Samples a point of the triangle, uniformly by solid angle. Returns the weights of the
-        corners a and c (that of b is the rest). ``sample.x`` chooses an arc from b to a point
+        corners a and c (b has the rest). ``sample.x`` chooses an arc from b to a point
         between a and c, ``sample.y`` a point of this arc."""
         a, b, c = (v / length for v, length in zip((self.a, self.b, self.c), self.lengths))
         # ----- The point n between a and c: (a, b, n) has a fraction x of the solid angle -----
         # The vector between a and n is o = a·(rest + turned) + c·turned (Peters, Alg. 2). With
         # volume = r sin(Ω/2) and denominator = r cos(Ω/2), all numbers below are sums of positive
-        # ones
+        # terms
         r = dr.hypot(self.volume, self.denominator)
         rest = r * dr.sin((1 - sample.x) * self.half_angle)
         turned = _one_plus_cosine(a, b) * dr.sin(sample.x * self.half_angle)
@@ -75,7 +76,7 @@ class SphericalTriangle:
         # ----- A point of the arc from b to n: the cosine with b is uniform in 1 … cos(b, n) -----
         cosine = dr.dot(b, n) / n_length
         sine = dr.norm(dr.cross(b, bn)) / n_length
-        # 1 - cosine and 1 + cosine, of which one may be small
+        # 1 - cosine and 1 + cosine, one of which may be small
         small = dr.square(sine) / (1 + dr.abs(cosine))
         versine = dr.select(cosine > 0, small, 1 - cosine)
         to_opposite = dr.maximum(dr.select(cosine > 0, 1 + cosine, small), _TINY)
@@ -116,5 +117,5 @@ def spherical_triangle(
 
 
 def _one_plus_cosine(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
-    """1 + the cosine between two unit vectors, exact also where they are opposite."""
+    """1 + the cosine between two unit vectors, exact even if they are opposite."""
     return 0.5 * dr.squared_norm(a + b)
