@@ -6,18 +6,18 @@ import functools
 
 import numpy as np
 
-#: Pixels on each side, along each axis, over which the radiance of a pixel is averaged, if nothing
-#: else is said.
+#: The default number of pixels on each side, along each axis, over which a pixel's radiance is
+#: averaged.
 RADIUS = 4
 
 
 def box_means(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
-    """The mean of each pixel of an image and its neighbours, shape [y, x]."""
+    """The mean over each pixel of an image and its neighbours, shape [y, x]."""
     return box_sums(image, radius) / _counts(image.shape, radius)
 
 
 def box_sums(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
-    """Sums over the neighbours of each pixel, itself included, shape [y, x]."""
+    """The sum over each pixel and its neighbours, shape [y, x]."""
     for axis in range(2):
         size = image.shape[axis]
         sums = np.cumsum(image, axis)
@@ -37,5 +37,5 @@ def squares_by_neighbours(image: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=8)
 def _counts(shape: tuple[int, int], radius: int) -> np.ndarray:
-    """The number of neighbours of each pixel, itself included, shape [y, x]."""
+    """The number of neighbours of each pixel, including the pixel itself, shape [y, x]."""
     return box_sums(np.ones(shape), radius)

@@ -9,13 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class CoarseFilm:
-    """Divides the pixels of a film into about equal rectangles.
+    """Divides the pixels of a film into rectangles of about equal size.
 
     Attributes:
         width, height: Number of rectangles along each axis.
         pixel_count: Number of pixels of the film.
-        of_pixel: The rectangle of each pixel, row by row; ``None`` if each pixel has its own.
-        samples: A pixel for each sample, as many of each rectangle.
+        of_pixel: The rectangle of each pixel, row by row; ``None`` if each pixel is a rectangle.
+        samples: The pixel of each sample; all rectangles have the same number of samples.
     """
 
     width: int
@@ -26,14 +26,14 @@ class CoarseFilm:
 
     @classmethod
     def whole(cls, width: int, height: int) -> CoarseFilm:
-        """Each pixel is a rectangle, and has one sample."""
+        """A film in which each pixel is a rectangle with one sample."""
         pixels = np.arange(width * height, dtype=np.uint32)
         return cls(width, height, width * height, None, pixels)
 
     @classmethod
     def of(cls, width: int, height: int, count: int) -> CoarseFilm:
-        """With about ``count`` samples, at least two of each rectangle, so that their variance can
-        be estimated."""
+        """A film with about ``count`` samples, at least two per rectangle, so that their variance
+        can be estimated."""
         pixels, scale = width * height, np.sqrt(count / (2 * width * height))
         if scale >= 1:
             film = cls.whole(width, height)

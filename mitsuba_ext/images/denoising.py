@@ -1,8 +1,8 @@
 """Denoises images with Open Image Denoise [1], through the package ``mitsuba-oidn``.
 
-The denoiser is guided by the albedo and the shading normal of each pixel, where these are known.
-Guides are denoised first, each on its own. A denoised image is biased: compare techniques by their
-own images.
+The albedo and the shading normal of each pixel, if known, guide the denoiser. Each guide is
+denoised first, separately. A denoised image is biased: compare techniques by their images before
+denoising.
 
 [1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
 """
@@ -22,7 +22,7 @@ from . import image_files, reading
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: The names of the guides, which end the names of their layers in an EXR, and their channels.
+#: The names of the guides, with which the names of their EXR layers end, and their channels.
 _GUIDES = {"albedo": "RGB", "normal": "XYZ"}
 
 
@@ -30,7 +30,7 @@ def denoiser() -> ModuleType:
     """The module ``mitsuba_oidn``.
 
     Raises:
-        InstallationError: The package is missing, or does not start here.
+        InstallationError: The package is missing or cannot be loaded.
     """
     try:
         import mitsuba_oidn
@@ -43,7 +43,7 @@ def denoiser() -> ModuleType:
 
 
 def remark(film: mi.Film) -> str | None:
-    """A warning about the film of an image to be denoised; ``None`` if there is none.
+    """A warning about the film of an image to be denoised; ``None`` if it is suitable.
 
     Raises:
         InputError: The film has no RGB image.
@@ -73,7 +73,7 @@ def denoise(
         is_linear: ``False`` for images with 8 bits, in [0, 1].
 
     Returns:
-        RGB, (height, width, 3). It may have NaN where ``pixels`` has.
+        RGB, (height, width, 3). It may have NaN where ``pixels`` has NaN.
 
     Raises:
         InstallationError: See :func:`denoiser`.
@@ -102,7 +102,7 @@ def denoise_file(
         metadata: Metadata for an EXR.
 
     Returns:
-        The names of the guides that were used.
+        The names of the guides used.
 
     Raises:
         InputError: The image cannot be read.
@@ -133,15 +133,15 @@ def denoise_file(
 def _without_noise(
     oidn: ModuleType, guide: np.ndarray, scale: float, offset: float
 ) -> np.ndarray:
-    """A denoised guide: with guides that have no noise, the denoiser keeps more detail. The guide
-    is ``scale`` · x + ``offset``, where x is in [0, 1], as the denoiser needs it."""
+    """A denoised guide: with noise-free guides, the denoiser keeps more detail. The guide is
+    ``scale`` · x + ``offset``, where x is in [0, 1], the range that the denoiser needs."""
     guide = np.asarray(guide, dtype=np.float32)
     result = np.array(oidn.denoise(np.ascontiguousarray((guide - offset) / scale), hdr=False))
     return np.ascontiguousarray(scale * result + offset, dtype=np.float32)
 
 
 def _layer(channels: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
-    """The only layer whose name ends with ``name``; ``None`` if there are none or several."""
+    """The only layer whose name ends with ``name``; ``None`` if there is none or several."""
     letters = _GUIDES[name]
     ends = {c.rpartition(".")[0] for c in channels if c.rpartition(".")[0].lower().endswith(name)}
     whole = [end for end in ends if all(f"{end}.{letter}" in channels for letter in letters)]

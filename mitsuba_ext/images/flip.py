@@ -1,10 +1,10 @@
-"""FLIP: how different two images look when one flips between them, from 0 (equal) to 1.
+"""FLIP: the perceived difference when flipping between two images, from 0 (equal) to 1.
 
 HDR-FLIP [1] is the largest LDR-FLIP [2] over a range of exposures. NVIDIA's ``flip-evaluator``
-computes it, but ends the process when an exposure is infinite (an image that is black or very dim),
-and does not support references that are mostly black. Therefore, the exposures are computed here,
-by its rule, after both images are divided by the brightest pixel of the reference: FLIP does not
-depend on the scale of the radiance, and the exposures depend on the reference only.
+computes it, but crashes when an exposure is infinite (an image that is black or very dim), and does
+not support references that are mostly black. The exposures are therefore computed here, by the same
+rule, after both images are divided by the brightest pixel of the reference: FLIP does not depend on
+the scale of the radiance, and the exposures depend only on the reference.
 
 [1] Andersson, Nilsson, Shirley, Akenine-Möller. Visualizing Errors in Rendered High Dynamic Range
 Images. Eurographics Short Papers 2021.
@@ -20,15 +20,15 @@ from types import ModuleType
 
 import numpy as np
 
-#: Luminance that the tone curve (ACES) maps to 0.85. The exposures range from the one that maps the
-#: brightest pixel to it to the one that maps the median to it [1].
+#: The luminance that the tone curve (ACES) maps to 0.85. The exposures range from the one that maps
+#: the brightest pixel to it to the one that maps the median to it [1].
 _EXPOSED = 2**1.0832972
 
-#: Luminance relative to the brightest pixel below which the median counts as black: there are never
-#: more than 23 exposures.
+#: The luminance, relative to the brightest pixel, below which the median counts as black: this
+#: limits the number of exposures to 23.
 _BLACK = 2**-23
 
-#: Images are clipped at this multiple of the brightest pixel, which is white at every exposure:
+#: The multiple of the brightest pixel at which images are clipped. It is white at every exposure:
 #: larger values would not change FLIP, but could overflow.
 _WHITE = 100
 
@@ -40,7 +40,7 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)
 def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
     """The mean of HDR-FLIP over all pixels.
 
-    The viewing condition is the default of FLIP: 67 pixels per degree (a 0.7 m wide 4K monitor
+    The viewing condition is FLIP's default: 67 pixels per degree (a 0.7 m wide 4K monitor
     seen from 0.7 m). Negative values, which filters with negative lobes produce, count as 0. All
     cores are used; the result does not depend on their number. The cost is proportional to the
     number of pixels and of exposures (log₂ of the range of luminance above the median, at least 2).
@@ -72,7 +72,8 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
         "stopExposure": stop,
         "numExposures": max(2, math.ceil(stop - start)),
     }
-    # The mean of flip-evaluator is summed in single precision: 0.02 % off at 1920x1080
+    # Not flip-evaluator's own mean, which is summed in single precision (an error of 0.02 % at
+    # 1920x1080)
     error_map, _, _ = evaluator.evaluate(
         *pixels, "HDR", applyMagma=False, computeMeanError=False, parameters=exposures
     )
@@ -83,8 +84,7 @@ def _evaluator() -> ModuleType | None:
     """The package, with OpenMP threads that sleep when they wait.
 
     By default they spin. They then slow down whatever is measured in the 8 ms after a call, and on
-    a busy machine they slow each other down (twice the time at 320x180, fifty times for tiny
-    images).
+    a busy machine, they slow each other down (2 times at 320x180, 50 times for tiny images).
     """
     policy = os.environ.get(_WAIT_POLICY)
     os.environ.setdefault(_WAIT_POLICY, "PASSIVE")  # read once, at the import

@@ -1,8 +1,8 @@
-"""Reads and writes images. A file is replaced as a whole, never left half written, and an EXR holds
+"""Reads and writes images. A file is replaced as a whole, never left half written. An EXR holds
 metadata about its render.
 
-EXRs are read by ``mi.Bitmap``, not by the OpenEXR package: for a damaged file, the latter prints
-warnings to the terminal and returns an empty image.
+EXRs are read with ``mi.Bitmap`` because the OpenEXR package, for a damaged file, prints warnings to
+the terminal and returns an empty image.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 #: Mitsuba's names of their formats.
 _FORMATS = dict(zip(EXTENSIONS, ("OpenEXR", "PNG", "JPEG", "JPEG", "RGBE", "PFM")))
 
-#: The attribute of an EXR's header with the checksum of channels and metadata, and the names of the
+#: The EXR header attribute that holds the checksum of channels and metadata, and the names of the
 #: attributes that it covers.
 _CHECKSUM = "checksum"
 
-#: Attributes that Mitsuba writes, whatever their values were.
+#: Attributes that Mitsuba overwrites.
 _OF_MITSUBA = ("generatedBy", "pixelAspectRatio", "screenWindowWidth")
 
-#: The attribute with the warnings of the render, a list of sentences as JSON.
+#: The attribute with the render's warnings, a list of sentences as JSON.
 REMARKS = "remarks"
 
 #: What :func:`fault_of` says about files of earlier versions, and of other programs.
@@ -57,8 +57,8 @@ def check_target(path: Path) -> None:
 
 
 def check_exr_target(path: Path) -> None:
-    """Raises :class:`InputError` if no EXR can be made at ``path``, or if there is a file that is
-    none: a scene names it, and must not replace others."""
+    """Raises :class:`InputError` if no EXR can be made at ``path``, or if another kind of file
+    exists there: a path named by a scene must not replace other files."""
     files.check_target(path)
     if path.suffix.lower() != ".exr":
         raise InputError(f'{path}: has the extension "{path.suffix}", and not ".exr"')
@@ -101,8 +101,8 @@ def _exr(
 
 
 def fault_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> str:
-    """Why the channels and the metadata of an EXR are not those that :func:`write_exr` wrote;
-    empty if they are."""
+    """Says why the channels and the metadata of an EXR differ from what :func:`write_exr` wrote;
+    empty if they do not."""
     if _CHECKSUM not in metadata:
         return NO_CHECKSUM
     try:
@@ -115,8 +115,9 @@ def fault_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -
 
 
 def remarks_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> list[str]:
-    """Sentences about an image that the user names: what :func:`mitsuba_ext.inputs.scene_remarks`
-    said when it was rendered, and whether it was changed since."""
+    """Warnings about an image that the user names: the remarks of
+    :func:`mitsuba_ext.inputs.scene_remarks` when it was rendered, and whether the file has changed
+    since."""
     remarks = []
     with contextlib.suppress(ValueError):
         found = json.loads(str(metadata.get(REMARKS, "[]")))
@@ -139,7 +140,7 @@ def write_exr_fast(
     path: Path, planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]
 ) -> None:
     """Writes 32-bit channels, (height, width), without compression: files of noisy images are 1.1
-    times as large, and written in a sixth of the time."""
+    times as large, and take a sixth of the time to write."""
     import OpenEXR
 
     header = {key: _attribute(value) for key, value in metadata.items()}
@@ -172,8 +173,8 @@ def open_bitmap(path: Path) -> tuple[mi.Bitmap, list[str], dict[str, object]]:
     """Opens any image that Mitsuba can read, whatever its extension.
 
     Returns:
-        The image, the names of its channels, and its metadata. Texts that are not in UTF-8 are left
-        out of the metadata.
+        The image, the names of its channels, and its metadata. Metadata texts that are not UTF-8
+        are omitted.
 
     Raises:
         InputError: The file is missing, damaged, or not an image.
@@ -198,7 +199,7 @@ def open_bitmap(path: Path) -> tuple[mi.Bitmap, list[str], dict[str, object]]:
 
 
 def check_file(path: Path) -> None:
-    """Raises :class:`InputError` if there is no such file."""
+    """Raises :class:`InputError` if the file does not exist."""
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
 
@@ -208,7 +209,7 @@ def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
     written to ``path``: writes one black pixel in the same folder.
 
     Raises:
-        InputError: It does not fit, or cannot be written.
+        InputError: The image does not fit into memory, or cannot be written.
     """
     import mitsuba as mi
 
@@ -230,7 +231,7 @@ def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _of_one_pixel(film: mi.Film) -> Iterator[None]:
-    """Within it, a film has a crop window of one pixel. Its contents are lost."""
+    """A context in which a film has a crop window of one pixel. The film's contents are lost."""
     import mitsuba as mi
 
     parameters, keys = mi.traverse(film), ("crop_size", "crop_offset")
@@ -241,7 +242,7 @@ def _of_one_pixel(film: mi.Film) -> Iterator[None]:
             parameters[key] = value
         parameters.update()
 
-    if not all(key in parameters for key in keys):  # a film of somebody else's
+    if not all(key in parameters for key in keys):  # a film from another package
         yield
         return
     crop([1, 1], [0, 0])
@@ -253,7 +254,7 @@ def _of_one_pixel(film: mi.Film) -> Iterator[None]:
 
 def _check_memory(film: mi.Film, channels: int) -> None:
     width, height = film.crop_size()
-    # In the film, in its image, and for the random numbers of a sample
+    # For the film, its image, and the random numbers of a sample
     needed, memory = int(width) * int(height) * (4 * 2 * channels + 16), memory_bytes()
     if memory and needed > memory:
         raise InputError(
@@ -278,8 +279,8 @@ def write_film(
     others: Mapping[str, np.ndarray] | None = None,
     is_compressed: bool = True,
 ) -> None:
-    """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
-    (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
+    """Writes the image of a film: all channels and ``others`` (arrays of shape (height, width)) to
+    an EXR, RGB to HDR and PFM, 8-bit sRGB to the other formats."""
     if path.suffix.lower() == ".exr" and not is_compressed:
         write_exr_fast(path, _planes(film, others or {}), metadata)
     else:
@@ -289,7 +290,7 @@ def write_film(
 def _bitmap(
     path: Path, film: mi.Film, metadata: Mapping[str, object], others: Mapping[str, np.ndarray]
 ) -> mi.Bitmap:
-    """What :func:`write_film` writes."""
+    """The bitmap that :func:`write_film` writes."""
     import mitsuba as mi
 
     if path.suffix.lower() == ".exr":
@@ -302,14 +303,14 @@ def _bitmap(
 
 
 def _planes(film: mi.Film, others: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    # The film's own bitmap may be of half precision
+    # The film's own bitmap may have half precision
     pixels = np.moveaxis(np.array(film.develop()), 2, 0)
     names = [entry.name for entry in film.bitmap().struct_()]
     return {**dict(zip(names, pixels)), **others}
 
 
 def write_rgb(path: Path, pixels: np.ndarray, metadata: Mapping[str, object]) -> None:
-    """Writes linear RGB, (height, width, 3), as :func:`write_film` does."""
+    """Writes linear RGB, (height, width, 3), like :func:`write_film`."""
     import mitsuba as mi
 
     if path.suffix.lower() == ".exr":
@@ -320,7 +321,7 @@ def write_rgb(path: Path, pixels: np.ndarray, metadata: Mapping[str, object]) ->
 
 
 def _converted(bitmap: mi.Bitmap, path: Path) -> mi.Bitmap:
-    """RGB, with the numbers of the format."""
+    """RGB in the number format of the file."""
     import mitsuba as mi
 
     eight_bit = path.suffix.lower() not in (".hdr", ".pfm")
@@ -333,8 +334,8 @@ def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
     is repeated.
 
     Args:
-        image: The tensor; its first channels are those of the film's image.
-        channels: Their names: :func:`film_channels`.
+        image: The tensor; its first channels are the channels of the film's image.
+        channels: The names of its channels, from :func:`film_channels`.
     """
     pixels = np.array(image, dtype=np.float32)
     if channels[0] == "Y":
@@ -361,14 +362,14 @@ def film_channels(film: mi.Film) -> list[str]:
 
 
 def _save(bitmap: mi.Bitmap, path: Path) -> None:
-    # By way of memory: on a full disk, Mitsuba 3.9.1 leaves half a file, and raises nothing
+    # Encoded in memory first: on a full disk, Mitsuba 3.9.1 leaves half a file and raises no error
     content = _encoded(bitmap, path)
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def _encoded(bitmap: mi.Bitmap, path: Path) -> bytes:
-    """The contents of a file of the format that ``path`` has."""
+    """The contents of a file in the format of ``path``."""
     import mitsuba as mi
 
     stream, kind = mi.MemoryStream(), _FORMATS.get(path.suffix.lower(), "OpenEXR")
@@ -380,7 +381,7 @@ def _encoded(bitmap: mi.Bitmap, path: Path) -> bytes:
 
 
 def _attribute(value: object) -> str | float | int:
-    """A value for the header of an EXR: text and numbers as they are, all else as JSON."""
+    """A value for the header of an EXR: text and numbers unchanged, everything else as JSON."""
     plain = isinstance(value, (str, float)) or (
         isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
     )

@@ -1,14 +1,14 @@
 """Measures the error of an image against a reference.
 
-All functions take linear RGB of shape (height, width, 3) and compute in double precision. Where the
-variance of the reference's mean is known, it is subtracted from the squared errors: its noise would
-otherwise add to every error. The difference can be zero or negative: then the error of the image is
-too small to be measured with this reference.
+All functions take linear RGB of shape (height, width, 3) and compute in double precision. If the
+variance of the reference's mean is known, it is subtracted from the squared errors: the reference's
+noise would otherwise add to every error. If the difference is zero or negative, the error of the
+image is too small to be measured with this reference.
 
-σ/μ and FLIP include the noise of the reference. They take absolute values, so the amount to
-subtract would depend on the correlation of the noise between channels, which is not stored. A
-reference by the same method with K times the samples of the image raises σ/μ by a factor of
-√(1 + 1/K), 3 % at K = 16.
+σ/μ and FLIP include the reference's noise. They take absolute values, so the amount to subtract
+would depend on the correlation of the noise between channels, which is not stored. A reference by
+the same method with K times the samples of the image raises σ/μ by a factor of √(1 + 1/K), 3 % at K
+= 16.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ import numpy as np
 from .box_filter import box_means
 from .flip import mean_flip
 
-#: Floor ε of the relative error, as a multiple of the square of the reference's mean.
+#: The term ε in the denominator of the relative error, as a multiple of the reference's squared
+#: mean.
 RELATIVE_FLOOR = 1e-2
 
-#: The percentile of the relative errors of pixels that stands for the worst ones.
+#: The percentile of the relative errors of pixels that represents the worst ones.
 _WORST = 99
 
-#: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
+#: The fraction of pixels, with the largest errors, that the trimmed relMSE omits.
 TRIMMED_SHARE = 1e-3
 
-#: Fewest images that :func:`errors_between_seeds` can measure.
+#: The minimum number of images that :func:`errors_between_seeds` can measure.
 MIN_SEEDS = 3
 
-#: The weights of the channels in a colour difference: their shares of the luminance [Cline 2007].
+#: The weights of the channels in a colour difference: their contributions to luminance [Cline
+#: 2007].
 COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
 
@@ -45,17 +47,17 @@ class Errors:
 
     Attributes:
         relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
-        relmse_trimmed: The same without the 0.1 % of the pixels that have the largest errors. It is
-            much smaller than ``relmse`` where a few fireflies make up most of the error.
+        relmse_trimmed: The same without the 0.1 % of pixels with the largest errors. It is much
+            smaller than ``relmse`` if a few fireflies cause most of the error.
         relmse_worst: The 99th percentile of (I−R)² / (R² + ε) over the pixels (means over their
-            channels): how large the errors of the worst pixels are.
+            channels), which measures the errors of the worst pixels.
         mse: (I−R)².
-        rmse: √mse; NaN where the subtraction left no positive ``mse``.
+        rmse: √mse; NaN if ``mse`` is not positive after the subtraction.
         sigma_mu: σ/μ, the coefficient of variation: the root of the mean squared colour difference,
             divided by the mean luminance of the reference (Cline, *Sampling Methods in Ray-Based
             Global Illumination*, 2007, Eq. 4.13). NaN if that luminance is not positive.
-        flip: The perceived difference, from 0 to 1, see :func:`~.flip.mean_flip`. NaN if it was
-            not asked for, or if ``flip-evaluator`` is not installed.
+        flip: The perceived difference, from 0 to 1, see :func:`~.flip.mean_flip`. NaN if it was not
+            requested, or if ``flip-evaluator`` is not installed.
     """
 
     relmse: float
@@ -78,7 +80,7 @@ def errors(
     Args:
         image: The image to measure.
         reference: The reference.
-        reference_variance: Variance of ``reference``, ``None`` if unknown.
+        reference_variance: Variance of ``reference``; ``None`` if unknown.
         flip: ``False`` skips FLIP, which takes more than 20 times as long as the others together
             (on two cores 0.3 s at 320x180, 10 s at 1920x1080).
 
@@ -152,12 +154,13 @@ def relative_mse(
 
 
 def reference_noise(reference: np.ndarray, reference_variance: np.ndarray) -> float:
-    """The relMSE of the reference itself, which is subtracted from every ``relmse``."""
+    """The relMSE of the reference itself, as subtracted from every ``relmse``."""
     return float((np.asarray(reference_variance, np.float64) * _weight(reference)).mean())
 
 
 def describe_non_finite(image: np.ndarray) -> str:
-    """Says how many pixels hold NaN or infinity, and where the first one is; empty if none do."""
+    """Says how many pixels hold NaN or infinity, and where the first one is; empty if all are
+    finite."""
     bad = ~np.isfinite(image).all(axis=2)
     count = int(bad.sum())
     if count == 0:

@@ -1,4 +1,4 @@
-"""Reads images of any source as linear RGB: our own renders and references, those of other
+"""Reads images from any source as linear RGB: our own renders and references, images of other
 renderers, photographs, arrays."""
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
     Returns:
         The image (height, width, 3) and its variance of the same shape (``None`` if unknown), in
         single precision, and the metadata of the file. The entry ``channels`` of the metadata names
-        the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``; ``remarks``, if
-        there are any, those of :func:`.image_files.remarks_of`.
+        the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``. The entry
+        ``remarks``, if present, holds the result of :func:`.image_files.remarks_of`.
 
     Raises:
         InputError: The file cannot be read, or does not contain exactly one image.
@@ -45,7 +45,7 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
         return _read_arrays(path)
     try:
         channels, metadata = _read_channels(path)
-    except MemoryError as error:  # also if only a damaged header says that it is so large
+    except MemoryError as error:  # possibly from the size in a damaged header
         raise InputError(f"{path}: unreadable (its size needs too much memory)") from error
     for pick in (_reference, _plain, _grey, _layer):
         found = pick(channels)
@@ -64,7 +64,7 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
 
 
 def srgb_to_linear(values: np.ndarray) -> np.ndarray:
-    """The inverse of the transfer function of sRGB (IEC 61966-2-1), for values from 0 to 1."""
+    """The inverse of the sRGB transfer function (IEC 61966-2-1), for values from 0 to 1."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
