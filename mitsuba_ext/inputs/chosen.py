@@ -1,4 +1,4 @@
-"""What a command renders: a scene, an integrator and a sensor."""
+"""The scene, integrator and sensor that a command renders."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from .scene_values import SceneValues
 from .scenes import LoadedScene, load_scene
 from .specifications import NamedIntegrator, make_named
 
-#: What renders a scene that asks for ``path``, or for no integrator, where none is named.
+#: The integrator for scenes that specify ``path`` or none, if the user names none.
 DEFAULT = "auto"
 
 
 @dataclass
 class Chosen:
-    """A scene, and the integrator and the sensor that render it.
+    """A scene with the integrator and the sensor that render it.
 
     Attributes:
         loaded: The scene.
         named: The integrator.
         sensor_index: The index of the sensor.
-        note: A sentence about the integrator, if none was named, and it is :data:`DEFAULT`, or
-            would be in another variant; else empty.
+        note: A sentence about the integrator if the user named none and it is :data:`DEFAULT`, or
+            would be in another variant; otherwise empty.
     """
 
     loaded: LoadedScene
@@ -45,9 +45,9 @@ class Chosen:
         """
         Args:
             loaded: The scene, with its integrator if ``specification`` is ``None``.
-            specification: The integrator; :data:`OF_SCENE` for the scene's. ``None`` for the
-                scene's, but :data:`DEFAULT` in place of ``path`` or none, in variants that it
-                supports.
+            specification: The integrator; :data:`OF_SCENE` for the scene's own. ``None`` for the
+                scene's own, except that :data:`DEFAULT` replaces ``path`` or a missing one in
+                variants that it supports.
 
         Raises:
             InputError: The integrator or the sensor cannot be used.
@@ -86,7 +86,7 @@ class Chosen:
 
 
 class LastScene:
-    """Keeps the scene that was loaded last, for images that need the same one."""
+    """Keeps the last loaded scene for further images of the same scene."""
 
     def __init__(self) -> None:
         self._key: tuple | None = None
@@ -104,10 +104,10 @@ class LastScene:
             path: The file.
             size: Size of the image; ``None`` for the film's.
             definitions: Values of the file's ``$name`` parameters.
-            specification: See :meth:`Chosen.of`.
+            specification: The integrator; see :meth:`Chosen.of`.
             values: Values of parameters of the loaded scene, from :func:`.scene_values.as_text`;
                 ``None`` if no image of the call has any.
-            moved, changes: See :func:`.scenes.load_scene`.
+            moved, changes: Arguments of :func:`.scenes.load_scene`.
 
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
@@ -116,7 +116,7 @@ class LastScene:
         items = tuple(definitions.items())
         key = (mi.variant(), path, size, items, is_own, has_values, changes)
         if key != self._key:
-            # Free the last scene first, as Dr.Jit compiles the methods of all living objects
+            # Free the last scene first, because Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
             gc.collect()  # the object that mi.traverse returns refers to itself
             self._loaded = load_scene(
@@ -154,6 +154,6 @@ def _of_scene(loaded: LoadedScene) -> NamedIntegrator:
         raise InputError(
             f"{loaded.source}: the scene has no integrator: name one with --integrator"
         )
-    # The identity is of the code alone: the hash of the scene's files covers the parameters
+    # The identity covers only the code: the hash of the scene's files covers the parameters
     code = hash_code([type(integrator)]) or ""
     return NamedIntegrator(name, name, dict(loaded.settings), integrator, code)

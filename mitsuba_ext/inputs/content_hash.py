@@ -33,12 +33,12 @@ def hash_each(files: Iterable[Path]) -> dict[Path, str]:
 def hash_files(
     hashes: Mapping[Path, str], parameters: Mapping[str, str], source: object = None
 ) -> str:
-    """SHA-256 over a scene's files, and its parameters.
+    """SHA-256 over a scene's files and parameters.
 
     Args:
         hashes: The hashes of the files, from :func:`hash_each`.
         parameters: Values of the ``$name`` placeholders.
-        source: The dict that the scene was made from, if it was not a file.
+        source: The dict from which the scene was made, if not from a file.
     """
     digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
     for file in hashes:
@@ -49,7 +49,7 @@ def hash_files(
 
 
 def hash_value(value: object) -> str:
-    """SHA-256 over text, or over a dict as ``mi.load_dict`` takes it."""
+    """SHA-256 over text, or over a dict for ``mi.load_dict``."""
     digest = hashlib.sha256()
     _feed(digest, value)
     return digest.hexdigest()
@@ -58,12 +58,12 @@ def hash_value(value: object) -> str:
 def hash_code(classes: Iterable[type]) -> str | None:
     """SHA-256 over the Python files that define these classes of plugins.
 
-    If one of them is written in Python, all files of this package that take part in a render are
-    included, since the class may import any of them.
+    If any of them is written in Python, all files of this package that take part in a render are
+    included, because the class may import any of them.
 
     Returns:
-        Empty if all classes are written in C++; ``None`` if a class has no file (it was written in
-        a notebook).
+        Empty if all classes are written in C++; ``None`` if a class has no file (for example,
+        because it is defined in a notebook).
     """
     bases = {base for cls in classes for base in cls.__mro__ if base.__module__ not in _COMPILED}
     if not bases:
@@ -94,7 +94,7 @@ def _feed(digest: Any, value: object) -> None:
     import mitsuba as mi
 
     if isinstance(value, Mapping):
-        for key in value:  # in the scene's order: it decides the order of the emitters
+        for key in value:  # in the scene's order, which determines the order of the emitters
             digest.update(f"{key}={{".encode())
             _feed(digest, value[key])
             digest.update(b"}")
@@ -113,6 +113,6 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(np.array(value.matrix).tobytes())
     elif isinstance(value, (str, bool, int, float)) or value is None:
         digest.update(repr(value).encode())
-    else:  # arrays of NumPy, Dr.Jit and others
+    else:  # NumPy, Dr.Jit and other arrays
         array = np.array(value)
         digest.update(repr(value).encode() if array.dtype == object else array.tobytes())

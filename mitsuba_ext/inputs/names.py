@@ -1,7 +1,7 @@
 """Names of integrators, of plugins that can be nested in them, and of parameters; suggestions for
 misspelt names.
 
-This module does not import Mitsuba, which takes a second, so that a misspelt name is reported at
+This module does not import Mitsuba, which would take a second, so misspelt names are reported at
 once.
 """
 
@@ -44,15 +44,15 @@ MITSUBA_INTEGRATORS: Mapping[str, tuple[str, ...]] = {
 }
 
 
-#: The suffixes of the files of Mitsuba's plugins.
+#: The suffixes of Mitsuba's plugin files.
 _LIBRARIES = (".so", ".dylib", ".dll")
 
-#: Stands for the scene's own integrator, where one is named.
+#: The name that stands for the scene's own integrator.
 OF_SCENE = "scene"
 
 
 def unknown_plugin(name: str, is_nested: bool = False) -> InputError:
-    """The error for a name that no integrator has and, if ``is_nested``, no decision either."""
+    """The error for a name of no integrator and, if ``is_nested``, of no decision."""
     kind = "nested plugin" if is_nested else "integrator"
     if name in _ours(is_nested=True):
         return InputError(
@@ -67,7 +67,7 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
     """The error for a parameter that a plugin did not read.
 
     Args:
-        kind: What the plugin is, for the message: "integrator" or "nested plugin".
+        kind: The kind of plugin for the message: "integrator" or "nested plugin".
         name: Its name.
         key: The name of the parameter.
     """
@@ -76,8 +76,8 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
 
 
 def explained(message: str) -> str:
-    """A message of Mitsuba's parser about an unknown plugin or an unknown parameter of an
-    integrator, with the known name that resembles it, if there is one."""
+    """Adds a similar known name, if any, to a message of Mitsuba's parser about an unknown plugin
+    or an unknown parameter of an integrator."""
     plugin = re.search(r'Plugin "(\w+)" not found!', message)
     if plugin:
         known = [name for of_kind in plugin_folders.plugin_names().values() for name in of_kind]
@@ -90,14 +90,14 @@ def explained(message: str) -> str:
 
 
 def check_integrator(specification: str) -> None:
-    """Refuses an unknown integrator, or an unknown plugin inside of one, before Mitsuba is
-    imported. (Afterwards, plugins of the user may be registered, and this does nothing.)
+    """Refuses an unknown integrator, or an unknown plugin nested in one, before Mitsuba is
+    imported. (Once it is imported, the user's plugins may be registered, and this does nothing.)
 
     Args:
         specification: A file, text that begins with the integrator's name, or :data:`OF_SCENE`.
 
     Raises:
-        InputError: There is no such plugin, or the text has another form.
+        InputError: The plugin does not exist, or the text has the wrong form.
     """
     is_file = Path(specification).suffix.lower() in (".xml", ".json")
     if specification == OF_SCENE:
@@ -107,7 +107,7 @@ def check_integrator(specification: str) -> None:
 
 
 def is_plugin(name: str) -> bool:
-    """Is it an integrator or a decision of ours, or a plugin of Mitsuba?"""
+    """Whether ``name`` is one of our integrators or decisions, or a Mitsuba plugin."""
     return name in (*_ours(True), *MITSUBA_INTEGRATORS) or is_file_of_mitsuba(name)
 
 
@@ -128,7 +128,7 @@ def _ours(is_nested: bool) -> list[str]:
 
 
 def is_file_of_mitsuba(name: str) -> bool:
-    """Is there a plugin in C++ of this name? ``True`` also if Mitsuba is not found."""
+    """Whether a C++ plugin has this name. Also true if Mitsuba is not found."""
     folder = _plugin_folder()
     if folder is None:
         return True
@@ -136,7 +136,7 @@ def is_file_of_mitsuba(name: str) -> bool:
 
 
 def _files_of_mitsuba() -> list[str]:
-    """The names of the plugins in C++."""
+    """The names of the C++ plugins."""
     folder = _plugin_folder()
     files = folder.glob("*.*") if folder else ()
     return [file.stem for file in files if file.suffix in _LIBRARIES]

@@ -1,4 +1,4 @@
-"""Checks a parsed scene for mistakes that Mitsuba names wrongly, or not at all."""
+"""Checks a parsed scene for mistakes that Mitsuba reports wrongly or not at all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..util.errors import InputError
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: The emitters that belong into shapes.
+#: The emitters that must be nested in shapes.
 _IN_SHAPES = ("area", "directionalarea", "solid_angle_area", "goniometric_area")
 
 
@@ -20,12 +20,12 @@ def check_parsed(state: mi.parser.ParserState) -> None:
 
     Raises:
         InputError: A film has no pixels (Mitsuba's sensors blame their field of view), or a light
-            that needs a shape is in none (Mitsuba leaves its own out of the image).
+            that needs a shape has none (Mitsuba's own lights are then missing from the image).
     """
     import mitsuba as mi
 
     for node in state.nodes:
-        own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
+        own = mi.Properties(node.props)  # a copy: reading a property marks it as queried
         for key in ("width", "height") if node.type == mi.ObjectType.Film else ():
             if key in own and own[key] == 0:
                 raise InputError(f"the film has the {key} 0{_place(state, node)}")

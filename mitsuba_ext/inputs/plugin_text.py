@@ -13,7 +13,7 @@ from ..util.errors import InputError
 def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
     """The plugin that ``text`` describes, as a dict for ``mi.load_dict``.
 
-    - A comma begins a parameter only where ``key=`` follows. Other commas belong to the value,
+    - A comma begins a parameter only if ``key=`` follows. Other commas belong to the value,
       which may be a list.
     - A value in square brackets is a nested plugin: text of the same form, to any depth. Its name
       determines its kind.
@@ -25,10 +25,10 @@ def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
 
     Args:
         text: The text.
-        kind: What it describes, for the message of an error.
+        kind: The kind of plugin, for error messages.
 
     Raises:
-        InputError: The text has another form; the message quotes it.
+        InputError: The text has the wrong form; the message quotes it.
     """
     try:
         return _parse(text)
@@ -37,7 +37,8 @@ def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
 
 
 def _meant(text: str) -> str:
-    """The right form of "bdpt,max_depth=4" or "bdpt: max_depth=4"; empty for other texts."""
+    """The correct form of "bdpt,max_depth=4" or "bdpt: max_depth=4", as a hint; empty for other
+    texts."""
     likely = re.sub(r"\W+", ":", text.strip(), count=1)
     try:
         _parse(likely)
@@ -62,7 +63,7 @@ def _parse(text: str) -> dict[str, Any]:
 
 
 def _split(text: str) -> Iterator[str]:
-    """The texts of the parameters: splits at commas that begin a parameter, outside of brackets."""
+    """The texts of the parameters: splits at commas that begin a parameter, outside brackets."""
     depths = _depths(text)
     if min(depths, default=0) < 0:
         raise ValueError('found "]" without "["')

@@ -1,4 +1,4 @@
-"""What the command line changes in the film and the integrator of a scene."""
+"""Changes that the command line makes to the film and the integrator of a scene."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
 
 
 class SceneChanges(NamedTuple):
-    """Changes of a scene, besides the size of its film.
+    """Changes to a scene other than the size of its film.
 
     Attributes:
-        crop: The crop window in pixels: width, height, and the place (x, y) of its upper left
-            corner. Replaces the crop window of the film.
-        rfilter: The reconstruction filter, as text: :func:`.plugin_text.parse_plugin`. Empty for
+        crop: The crop window in pixels, which replaces the film's: width, height, and the position
+            (x, y) of its upper left corner.
+        rfilter: The reconstruction filter, as text for :func:`.plugin_text.parse_plugin`. Empty for
             the film's own.
-        max_depth: The maximum depth, instead of the one that the scene's integrator has.
+        max_depth: The maximum depth, which replaces the value of the scene's integrator.
     """
 
     crop: tuple[int, int, int, int] | None = None
@@ -30,7 +30,7 @@ class SceneChanges(NamedTuple):
     max_depth: int | None = None
 
     def described(self) -> dict[str, str]:
-        """What is changed, by name."""
+        """The changes, by name."""
         found = {"reconstruction filter": self.rfilter}
         if self.crop is not None:
             found["crop window"] = "{}x{}+{}+{}".format(*self.crop)
@@ -39,7 +39,7 @@ class SceneChanges(NamedTuple):
         return {name: value for name, value in found.items() if value}
 
 
-#: Width and height of a film for which a scene gives none.
+#: The width and height of a film for which a scene gives none.
 _DEFAULT_SIZE = 768, 576
 
 #: Leaves a scene as it is.
@@ -49,11 +49,11 @@ UNCHANGED = SceneChanges()
 def change_films(
     state: mi.parser.ParserState, size: tuple[int, int] | None, changes: SceneChanges
 ) -> None:
-    """Changes all films of a parsed scene. A sensor without one gets one.
+    """Changes all films of a parsed scene. A sensor without a film gets one.
 
     Raises:
         InputError: ``size`` is given, and a film has a crop window; the new crop window does not
-            fit into a film; or there is no such filter.
+            fit into a film; or the filter does not exist.
     """
     import mitsuba as mi
 
@@ -112,7 +112,7 @@ def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:
 def _children(
     state: mi.parser.ParserState, node: mi.parser.SceneNode, kind: mi.ObjectType
 ) -> list[tuple[str, object]]:
-    """The children of a node that are of a kind, by their keys."""
+    """The children of a node that have the given kind, with their keys."""
     import mitsuba as mi
 
     properties, found = mi.Properties(node.props), []  # a copy: reading marks as queried

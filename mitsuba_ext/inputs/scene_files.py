@@ -1,4 +1,4 @@
-"""The files of a scene: its XML files, and all files that these name."""
+"""The files of a scene: its XML files, and all files named in them."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def _included(path: Path) -> list[Path]:
 
 
 def named_by_absolute_path(files: list[Path], parameters: Mapping[str, str]) -> list[str]:
-    """The files that XML files include, and the spectra that they name, by an absolute path."""
+    """The included files and the spectra that XML files name by absolute paths."""
     return [name for _, name in _named_in_xml(files, parameters) if Path(name).is_absolute()]
 
 
 def named_in(state: mi.parser.ParserState) -> Iterator[tuple[tuple[object, str], str]]:
-    """The string parameters of a scene's plugins, each with its node and key: these can be names of
-    files."""
+    """The string parameters of a scene's plugins, which can be file names, each with its node and
+    key."""
     import mitsuba as mi
 
     for node in state.nodes:
@@ -63,7 +63,7 @@ def named_in(state: mi.parser.ParserState) -> Iterator[tuple[tuple[object, str],
 
 
 def _named_in_xml(files: list[Path], parameters: Mapping[str, str]) -> Iterator[tuple[Path, str]]:
-    """The files that ``filename`` attributes name: included files, and spectra. The parser replaces
+    """The files named in ``filename`` attributes: included files and spectra. The parser replaces
     both by their contents."""
     elements = []
     values = {}

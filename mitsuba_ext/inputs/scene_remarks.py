@@ -7,8 +7,8 @@ import mitsuba as mi
 from ..scene.nesting import class_name, with_nested
 from .scenes import LoadedScene
 
-#: Integrators that need no light and ignore media by design: two show properties of surfaces, one
-#: renders primitives that emit.
+#: Integrators that need no light and ignore media by design: two show properties of surfaces, and
+#: one renders emissive primitives.
 _NO_LIGHT_NEEDED = {
     "AOVIntegrator", "DepthIntegrator", "BasicVolumetricPrimitiveRadianceFieldIntegrator",
 }  # fmt: skip
@@ -18,16 +18,16 @@ _SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpa
 
 
 def scene_remarks(loaded: LoadedScene, integrator: mi.Integrator, name: str) -> list[str]:
-    """Warns of media that ``integrator`` does not render, and of a scene without lights.
+    """Warns about media that ``integrator`` does not render, and about a scene without lights.
 
     Parameters:
         loaded: The scene.
-        integrator: What renders it.
+        integrator: The integrator that renders it.
         name: The name of the integrator in the sentences.
 
     Returns:
-        Sentences. There is none about integrators that are neither Mitsuba's nor ours: they may
-        render media, and may need no lights.
+        Sentences; none about integrators that are neither Mitsuba's nor ours, because they may
+        render media and may need no lights.
     """
     tracers = [
         each

@@ -1,6 +1,6 @@
 """Sets values of a scene's objects, by keys of ``mi.traverse``, without loading the scene again.
 
-Values are passed as JSON text, so that requests to other processes can hold and compare them.
+Values are passed as JSON text, which requests to other processes can hold and compare.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ..util.errors import InputError, did_you_mean, one_line
 
 
 def as_text(values: Mapping[str, Any]) -> str:
-    """Values as JSON; empty text for none.
+    """Values as JSON text; empty if there are none.
 
     Args:
         values: Numbers, lists of them, NumPy and Dr.Jit arrays, and transforms, by key.
 
     Raises:
-        InputError: Something else is among them.
+        InputError: A value has another type.
     """
     plain = {key: _plain(key, value) for key, value in values.items()}
     return json.dumps(plain, sort_keys=True) if plain else ""
@@ -59,7 +59,7 @@ class SceneValues:
         self._before: dict[str, Any] = {}
 
     def set(self, text: str) -> None:
-        """Sets values, and resets all others that were set before to the scene's own.
+        """Sets values, and resets all other values set before to the scene's own.
 
         Args:
             text: The values, from :func:`as_text`.
@@ -104,7 +104,7 @@ def _like(own: Any, value: Any) -> Any:
         if array.shape != tuple(shape):
             raise ValueError(f"{'x'.join(map(str, shape))} numbers are expected")
         return kind(array)
-    # One number can stand for a colour, but not for a list of vertices
+    # A single number can stand for a colour, but not for a list of vertices
     is_flexible = dr.size_v(kind) != dr.Dynamic and not isinstance(value, list)
     if not is_flexible and np.size(value) != len(own):
         raise ValueError(f"{len(own)} numbers are expected")
@@ -124,7 +124,7 @@ def _short(value: Any) -> str:
 
 
 def _unknown(key: str, known: list[str]) -> str:
-    """Says that a scene has no such parameter, and what was probably meant."""
+    """Says that a scene has no such parameter, and suggests the one that was probably meant."""
     name = key.partition(".")[0]
     own = [each for each in known if each.startswith(f"{name}.")]
     if own:

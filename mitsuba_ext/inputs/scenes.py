@@ -1,7 +1,7 @@
 """Loads scenes for the command line and for notebooks.
 
-Mitsuba's ``load_file`` cannot change the size of a film, and gives neither the files of a scene nor
-the maximum depth of its integrator. :func:`load_scene` gets these from ``mi.parser``, and turns
+Mitsuba's ``load_file`` cannot change the size of a film, and returns neither the files of a scene
+nor the maximum depth of its integrator. :func:`load_scene` gets these from ``mi.parser``, and turns
 every error in a scene into an :class:`InputError` of one line.
 """
 
@@ -26,11 +26,11 @@ from .scene_files import files_of, named_in, parameters_of
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Settings that all integrators of a comparison share: the maximum depth, the depth at which
+#: The settings that all integrators of a comparison share: the maximum depth, the depth at which
 #: Russian roulette begins, and whether emitters are hidden from the camera.
 SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
-#: How Mitsuba's integrators print a depth without limit.
+#: The number that Mitsuba's integrators print for an unlimited depth.
 _UNLIMITED = 2**32 - 1
 
 
@@ -38,7 +38,7 @@ def check_source(source: object) -> None:
     """Checks that ``source`` can be a scene: a file, or a dict of the active variant.
 
     Raises:
-        InputError: It is neither.
+        InputError: ``source`` is neither.
     """
     if isinstance(source, Mapping):
         check_variant(source)
@@ -52,11 +52,11 @@ def check_source(source: object) -> None:
 
 
 def check_variant(value: object) -> None:
-    """Checks that the objects of Mitsuba in ``value`` (a scene's dict, or an item of one) are of
-    the active variant: Mitsuba ignores others, or misinterprets them. (It dies of ``None``.)
+    """Checks that the Mitsuba objects in ``value`` (a scene's dict, or an item of one) belong to
+    the active variant: Mitsuba ignores or misinterprets others. (It crashes on ``None``.)
 
     Raises:
-        InputError: One is of another variant, or ``None``.
+        InputError: An object belongs to another variant, or is ``None``.
     """
     import mitsuba as mi
 
@@ -74,23 +74,23 @@ def check_variant(value: object) -> None:
 
 @dataclass
 class LoadedScene:
-    """A scene, and data about it that Mitsuba's scene object does not have.
+    """A scene, with data that Mitsuba's scene object does not have.
 
     Attributes:
         scene: The ``mi.Scene``.
         path: The XML file; ``None`` for a scene made from a dict.
         parameters: The ``$name`` parameters that were passed to it.
-        files: The XML file, and all files that it names, by their absolute paths.
-        file_hashes: SHA-256 of each of them, by its path with links resolved.
+        files: The absolute paths of the XML file and of all files that it names.
+        file_hashes: SHA-256 of each file, by its path with links resolved.
         content_hash: SHA-256 over the XML or dict, its parameters, and all these files.
         settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, if it has them, and
             ``hide_emitters`` if it is set.
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
-        only_says_path: Does the scene say nothing else about its integrator than ``path`` and these
-            ``settings``? True also if there is none.
-        changes: What the caller has changed, besides the size.
-        has_media: Are there participating media in the scene? Also true if its file names one, and
-            there are instances, which may contain it.
+        only_says_path: Whether the scene specifies no more about its integrator than ``path`` and
+            these ``settings``. Also true if it has no integrator.
+        changes: The caller's changes other than the size.
+        has_media: Whether the scene has participating media. Also true if its file names one and
+            the scene has instances, which may contain it.
         size: Width and height of the image in pixels (of the crop window, if there is one).
     """
 
@@ -115,7 +115,7 @@ class LoadedScene:
 
 def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
     """A short name, taken from the file. A file ``scene.xml`` gets the name of its folder if the
-    given path names it: ``kitchen/scene.xml`` is "kitchen", and ``scene.xml`` is "scene"."""
+    path includes it: ``kitchen/scene.xml`` is "kitchen", and ``scene.xml`` is "scene"."""
     if source is None or isinstance(source, Mapping):
         return "scene"
     path = Path(source)
@@ -124,7 +124,7 @@ def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raises :class:`InputError` if there is no such file; does not import Mitsuba."""
+    """Raises :class:`InputError` if the file does not exist; does not import Mitsuba."""
     name = str(path.resolve())
     if not is_utf8(name):
         raise InputError(
@@ -148,19 +148,19 @@ def load_scene(
 
     Args:
         source: The XML file, or a dict as for ``mi.load_dict``.
-        size: Width and height that replace those of the film.
+        size: Width and height that replace the film's.
         parameters: Values for the ``$name`` placeholders of the file.
-        keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
-            integrator is not installed can be rendered with another.
-        keep_names: Keep objects as they are in the file, for ``mi.traverse``. By default, Mitsuba
+        keep_integrator: ``False`` drops the scene's integrator, so that a scene whose integrator is
+            not installed can be rendered with another one.
+        keep_names: Whether to keep the file's objects for ``mi.traverse``. By default, Mitsuba
             merges meshes of the same material, and equal materials.
-        moved: Maps the absolute path of a file to its present path; returns all other texts as
-            they are.
-        changes: What else replaces something of the file.
+        moved: A function that maps the old absolute path of a file to its present path and returns
+            all other texts unchanged.
+        changes: Other changes to the scene.
 
     Raises:
-        InputError: The file is missing or broken, something in it cannot be made or is of another
-            variant, it has no sensor, or ``size`` or ``changes`` do not fit the scene.
+        InputError: The file is missing or broken, an object in it cannot be made or belongs to
+            another variant, it has no sensor, or ``size`` or ``changes`` do not fit the scene.
     """
     import mitsuba as mi
 
@@ -194,7 +194,7 @@ def load_scene(
             if changes.max_depth is not None:
                 _set_max_depth(state, changes.max_depth, keep_integrator)
             integrator = _integrator_node(state)
-            # Before transform_all(): afterwards, a node may be freed memory
+            # Before transform_all(), after which a node's memory may be freed
             integrator_name = integrator.props.plugin_name() if integrator else ""
             settings, only_says_path = _settings(integrator), _only_says_path(state)
             if changes.max_depth is not None:
@@ -234,7 +234,7 @@ def load_scene(
 
 
 def _unused(path: Path, given: list[str]) -> str:
-    """Says which of the given ``$parameters`` a scene file does not have."""
+    """Says which given ``$parameter`` a scene file does not have."""
     known = parameters_of(path)
     key = next((key for key in given if key not in known), given[0])
     hint = did_you_mean(key, known)
@@ -246,7 +246,7 @@ def _unused(path: Path, given: list[str]) -> str:
 def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of a scene's dict and of its bitmaps. In spectral variants, Mitsuba's ``bitmap``
     converts the pixels of a ``mi.Bitmap`` in place: without the copy, loading the dict again would
-    give another scene."""
+    produce another scene."""
     import mitsuba as mi
 
     def copy(value: Any) -> Any:
@@ -296,21 +296,21 @@ def _only_says_path(state: mi.parser.ParserState) -> bool:
 
 
 def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
-    """The integrator of the scene that traces the paths: inside a wrapper such as ``aov``, the
-    first one that sets ``max_depth``."""
+    """The scene's integrator that traces the paths: inside a wrapper such as ``aov``, the first one
+    that sets ``max_depth``."""
     nodes = _integrator_nodes(state)
     with_depth = [node for node in nodes if SETTINGS[0] in node.props]
     return (with_depth or nodes or [None])[0]
 
 
 def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
-    """The :data:`SETTINGS` of an integrator: those that the file sets, else the default depths,
-    which can only be read from the integrator's ``str()``."""
+    """The :data:`SETTINGS` of an integrator: the values in the file, otherwise the default depths,
+    which can be read only from the integrator's ``str()``."""
     import mitsuba as mi
 
     if node is None:
         return {}
-    own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
+    own = mi.Properties(node.props)  # a copy: reading a property marks it as queried
     text = _printed(node)
     settings: dict[str, int | bool] = {}
     for key in SETTINGS:
@@ -324,7 +324,7 @@ def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
 
 
 def _printed(node: mi.parser.SceneNode) -> str:
-    """The ``str()`` of an integrator with its default parameters; empty if these are unknown."""
+    """The ``str()`` of an integrator with its default parameters; empty if it cannot be made."""
     import mitsuba as mi
 
     with contextlib.suppress(Exception):  # a wrapper or an unknown plugin
@@ -334,10 +334,10 @@ def _printed(node: mi.parser.SceneNode) -> str:
 
 
 def _set_max_depth(state: mi.parser.ParserState, max_depth: int, is_needed: bool) -> None:
-    """Sets the maximum depth of all integrators in the scene that have one.
+    """Sets the maximum depth of all integrators in the scene that have this parameter.
 
     Raises:
-        InputError: It ``is_needed``, and none of the integrators has one.
+        InputError: ``is_needed`` is true, and no integrator has this parameter.
     """
     key, nodes = SETTINGS[0], _integrator_nodes(state)
     found = [node for node in nodes if key in node.props or f"{key} =" in _printed(node)]
@@ -363,8 +363,8 @@ def _drop_integrators(state: mi.parser.ParserState) -> None:
 
 
 def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
-    """Is the node an integrator? The parser of dicts does not know the kind of a plugin that is
-    written in Python, so this function instantiates it."""
+    """Whether the node is an integrator. The parser of dicts does not know the kind of a plugin
+    that is written in Python, so this function instantiates it."""
     import mitsuba as mi
 
     if node.type != mi.ObjectType.Unknown:
@@ -372,5 +372,5 @@ def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
     try:
         properties = mi.Properties(node.props.plugin_name())
         return isinstance(mi.PluginManager.instance().create_object(properties), mi.Integrator)
-    except Exception:  # no such plugin, or it cannot be made without its parameters
+    except Exception:  # unknown, or needs parameters
         return key == "integrator"

@@ -34,14 +34,14 @@ class NamedIntegrator:
     """An integrator, its name and its parameters.
 
     Attributes:
-        label: Its name in tables.
-        name: Its plugin's name.
-        parameters: Its parameters, as far as they are known; a dict for a nested plugin.
+        label: The integrator's name in tables.
+        name: The plugin's name.
+        parameters: The known parameters; a nested plugin is a dict.
         integrator: The integrator.
-        identity: Text that changes whenever the integrator could render other images or take other
-            time. It covers the plugins, their parameters, and the code of plugins that are written
-            in Python. If these cannot be known (an integrator that exists already, code without a
-            file), the identity is random, so that stored runs are never used.
+        identity: Text that changes whenever the integrator could render different images or take
+            different time. It covers the plugins, their parameters, and the code of plugins written
+            in Python. If these are unknown (for an existing integrator, or code without a file),
+            the identity is random, so stored runs are never used.
     """
 
     label: str
@@ -62,14 +62,14 @@ def make_named(
         specification: ``name`` or ``name:key=value,key=value``
             (:func:`.plugin_text.parse_plugin`); the path of an XML file whose root is an
             ``<integrator>``, or of a JSON file with a dict for ``mi.load_dict``; such a dict; or an
-            integrator that exists already (which inherits nothing).
-        inherited: Parameters (from :attr:`LoadedScene.settings`) for each integrator, nested ones
-            included, that has them and does not set them.
-        label: The label. Default: made from the specification.
+            existing integrator (which inherits nothing).
+        inherited: Parameters (from :attr:`LoadedScene.settings`) for each integrator, including
+            nested ones, that has them and does not set them.
+        label: The label. By default, it is derived from the specification.
 
     Raises:
-        InputError: There is no such file or plugin, it is no integrator, it rejects a parameter, or
-            it is of another variant.
+        InputError: The file or plugin does not exist, is not an integrator, rejects a parameter, or
+            belongs to another variant.
     """
     import mitsuba as mi
 
@@ -118,7 +118,7 @@ class _Made:
 def _identity(made: _Made, content: str | dict[str, Any]) -> str:
     """The identity of an integrator that was made from its parameters, or from ``content``."""
     try:
-        # str() shows the defaults of parameters that are not set; addresses differ each time
+        # str() shows the defaults of parameters that are not set; addresses vary
         state = re.sub("0x[0-9a-f]+", "", str(made.integrator))
     except Exception:  # to_string() is optional for a class in Python
         state = ""
@@ -130,12 +130,12 @@ def _identity(made: _Made, content: str | dict[str, Any]) -> str:
 
 
 def _never_again() -> str:
-    """An identity that no other integrator has, nor this one in another process."""
+    """An identity that no other integrator has, not even this one in another process."""
     return uuid.uuid4().hex
 
 
 def _is_alive(specification: object) -> bool:
-    """Is it an object of Mitsuba, or a dict that contains one? Its state can change."""
+    """Whether it is a Mitsuba object, or a dict that contains one. Its state can change."""
     import mitsuba as mi
 
     if isinstance(specification, Mapping):
@@ -144,7 +144,7 @@ def _is_alive(specification: object) -> bool:
 
 
 def is_fragment(path: Path) -> bool:
-    """Is the file an integrator, and not a scene? ``False`` for a file that cannot be read."""
+    """Whether the file is an integrator rather than a scene. False if it cannot be read."""
     if path.suffix.lower() == ".json":
         return True
     try:
@@ -161,7 +161,7 @@ def _make(
     """Makes an integrator after the plugins nested in it (whose ``kind`` is "nested plugin").
 
     Raises:
-        InputError: The plugin is unknown, or it rejects or does not know a parameter.
+        InputError: The plugin is unknown, or rejects a parameter.
     """
     import mitsuba as mi
 
@@ -173,7 +173,7 @@ def _make(
     }
     objects = {key: made.integrator for key, made in nested.items()}
     if any(isinstance(item, mi.Integrator) for item in objects.values()):
-        inherited = {}  # these are for the nested integrator, which traces the paths
+        inherited = {}  # meant for the nested integrator, which traces the paths
     name = plugin["type"]
     if _is_ours(name):  # it refuses parameters that it does not have
         known = parameter_names(name)
@@ -274,7 +274,7 @@ def _class_of(name: str) -> type | None:
     except Exception:  # a plugin that needs parameters, such as a wrapper
         pass
     if _is_ours(name):
-        return _Made  # the hash of any class of this package covers all of its files
+        return _Made  # the hash of any class of this package covers all its files
     return mi.Object if is_file_of_mitsuba(name) else None
 
 
@@ -283,8 +283,8 @@ def _is_ours(name: str) -> bool:
 
 
 def _knows(name: str, key: str, value: Value) -> bool:
-    """Does a plugin query the parameter? ``False`` for a plugin that cannot be made without others,
-    such as a wrapper."""
+    """Whether a plugin queries the parameter. False for a plugin that needs others, such as a
+    wrapper."""
     import mitsuba as mi
 
     properties = mi.Properties(name)

@@ -42,9 +42,9 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
 
 
 def import_from_here(name: str) -> ModuleType:
-    """Imports a module, which may lie in the current folder. (A command that pip has installed does
-    not look there.) Installed modules come first, and later imports do not look there: a file of
-    the folder must not take the place of a module that is imported by somebody else."""
+    """Imports a module, possibly from the current folder. (A command installed by pip does not
+    search it.) Installed modules take precedence, and later imports do not search the folder: a
+    file there must not shadow a module that other code imports."""
     here = os.getcwd()
     if here in sys.path:
         return importlib.import_module(name)
