@@ -1,7 +1,7 @@
 """Prints the report of ``mitsuba-ext doctor``: versions, hardware, LLVM, plugins, tiny renders.
 
-Each part is independent: one that fails prints why, and the other parts follow. The renders run in
-another process, because an unusable backend ends its process without an exception.
+Each part is independent: if one fails, it prints why, and the other parts follow. The renders run
+in another process, because an unusable backend crashes without an exception.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .processes import python_command
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Seconds after which the remaining plugins are not tried.
+#: The time limit of all renders, in seconds; the remaining plugins are not tried.
 RENDER_BUDGET = 120.0
 
 
@@ -35,11 +35,11 @@ def main(variant: str | None = None) -> int:
     """Prints the report.
 
     Args:
-        variant: The variant to render in. Default: the active one, else the first supported one
-            whose backend works here.
+        variant: The variant to render in. By default, the active one, otherwise the first supported
+            one whose backend works here.
 
     Returns:
-        0 if everything works, 1 if a part failed: the exit code of the command.
+        The exit code of the command: 0 if everything works, 1 if a part failed.
     """
     parts: list[tuple[str, Callable[[], Iterator[str]]]] = [
         ("Versions", _versions),
@@ -113,7 +113,7 @@ def _llvm() -> Iterator[str]:
         yield f"found {library}: {llvm.fault(library) or 'usable'}"
     problem = runtime.llvm_problem()
     if problem:
-        # A machine with a GPU does without LLVM, so this alone is not a failure there.
+        # A machine with a GPU does not need LLVM, so this alone is not a failure there
         yield problem if _has_cuda() else f"! {problem}"
 
 
@@ -147,7 +147,7 @@ def _plugins() -> Iterator[str]:
 
 
 def _renders(variant: str) -> Iterator[str]:
-    """One line per integrator. If an integrator ends its process, a new process renders the rest.
+    """One line per integrator. If an integrator crashes, a new process renders the rest.
     """
     from .registry import plugin_names
 
@@ -165,7 +165,7 @@ def _renders(variant: str) -> Iterator[str]:
 
 
 def _line(result: dict) -> str:
-    if "refused" in result:  # e.g. it needs a spectral variant: no failure
+    if "refused" in result:  # not a failure: for example, it needs a spectral variant
         return f"{result['name']}: not tried: {result['refused']}"
     if "error" in result:
         return f"! {result['name']}: {result['error']}"
@@ -174,7 +174,7 @@ def _line(result: dict) -> str:
 
 
 def _render_elsewhere(variant: str, names: list[str], timeout: float) -> list[dict]:
-    """Results for ``names`` in their order, up to the first integrator that ends the process."""
+    """Results for ``names``, in order, up to the first integrator that crashes."""
     command = python_command("mitsuba_ext.startup.doctor", variant, *names)
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         try:
@@ -198,13 +198,13 @@ def _exit_name(code: int) -> str:
 
 
 def _render_here(variant: str, names: list[str]) -> None:
-    """Prints one line of JSON for each integrator named."""
+    """Prints one line of JSON for each integrator."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np
 
     mi.set_variant(variant)
-    mi.set_log_level(mi.LogLevel.Error)  # stdout is for the results, not for warnings
+    mi.set_log_level(mi.LogLevel.Error)  # keeps warnings out of stdout, which holds the results
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=32, height=32)
     # Some integrators need a lens
@@ -232,7 +232,7 @@ def _render_here(variant: str, names: list[str]) -> None:
 
 
 def _make(name: str) -> tuple[str, mi.Integrator]:
-    """A label and the integrator with default parameters. One that needs a nested integrator gets
+    """A label and the integrator with default parameters. If it needs a nested integrator, it gets
     ``composed_path``."""
     import mitsuba as mi
 

@@ -12,9 +12,9 @@ class _Collector:
     """The garbage collector, which all threads share.
 
     Attributes:
-        lock: Held while it is stopped or started.
-        stops: How many contexts keep it stopped now.
-        was_enabled: Was it enabled before the first of them?
+        lock: Held while the collector is being stopped or started.
+        stops: The number of contexts that currently keep it stopped.
+        was_enabled: Whether it was enabled before the first of these contexts.
     """
 
     def __init__(self) -> None:
@@ -29,8 +29,8 @@ def garbage_left_alone() -> Iterator[None]:
     """Stops Python's garbage collector while active, in any thread.
 
     To trace a call of a BSDF's method, Dr.Jit iterates over all living BSDFs. While it runs the
-    methods of those that are written in Python, the collector could free others, of scenes that are
-    no longer used. Dr.Jit would then access freed memory, and the process would end.
+    methods of BSDFs written in Python, the collector could free BSDFs of scenes that are no longer
+    used. Dr.Jit would then access freed memory and crash.
     """
     with _collector.lock:
         if _collector.stops == 0:

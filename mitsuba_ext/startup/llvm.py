@@ -1,8 +1,9 @@
-"""Which LLVM library Dr.Jit would load, which others there are, and whether they work.
+"""Finds the LLVM library that Dr.Jit would load, and others on this machine, and checks whether
+they work.
 
-Dr.Jit loads libLLVM when it is imported. A library that it cannot use ends the process at the
-first kernel instead of raising an exception, so the choice has to be made beforehand.
-:mod:`.llvm_install` gets a library that works.
+Dr.Jit loads libLLVM when it is imported. An unusable library crashes at the first kernel instead of
+raising an exception, so a library has to be chosen beforehand. :mod:`.llvm_install` installs one
+that works.
 """
 
 from __future__ import annotations
@@ -26,14 +27,15 @@ from pathlib import Path
 #: The environment variable that overrides Dr.Jit's own search.
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-#: Dr.Jit 1.5 refuses older libraries. On x86, LLVM 15 and 16 cannot compile ``llvm.minimum`` and
-#: ``llvm.maximum`` (llvm-project issue 53353), whether or not the CPU has AVX-512.
+#: The oldest usable version. Dr.Jit 1.5 refuses older libraries. On x86, LLVM 15 and 16 cannot
+#: compile ``llvm.minimum`` and ``llvm.maximum`` (llvm-project issue 53353), whether or not the CPU
+#: has AVX-512.
 OLDEST = 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
 
-#: A library newer than this must pass :func:`probe`.
+#: The newest version that does not have to pass :func:`probe`.
 NEWEST_TESTED = 22
 
-#: Where Dr.Jit 1.5 searches if the loader finds no ``libLLVM.so`` (src/llvm_api.cpp).
+#: The places that Dr.Jit 1.5 searches if the loader finds no ``libLLVM.so`` (src/llvm_api.cpp).
 _DRJIT_GLOBS = {
     "linux": [
         f"/usr/lib/{folder}/libLLVM*.so.*"
@@ -62,8 +64,8 @@ _OTHER_GLOBS = {
 
 _ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 
-# The literal ``scale`` differs each time: else Dr.Jit could load the kernel from its disk cache,
-# compiled by another library.
+# The literal ``scale`` differs each time; otherwise Dr.Jit could load the kernel from its disk
+# cache, compiled by another library.
 _PROBE = """
 import sys
 try:
@@ -82,11 +84,11 @@ sys.exit(0 if ok else "wrong numbers")
 
 @dataclass(frozen=True)
 class Library:
-    """A file that holds LLVM.
+    """An LLVM library file.
 
     Attributes:
-        path: The file with links followed, or the user's text if there is no such file; empty for a
-            library in this process whose file is unknown.
+        path: The file with links resolved, or the user's text if the file does not exist; empty for
+            a library in this process whose file is unknown.
         version: The version in the file's name, e.g. ``(19, 1)``; empty if there is none.
     """
 
@@ -95,7 +97,8 @@ class Library:
 
     @classmethod
     def at(cls, path: str) -> Library:
-        """The library at ``path``, its version read from the name of the file behind the links."""
+        """The library at ``path``, with the version in the name of its file after resolving
+        links."""
         resolved = os.path.realpath(path) if os.path.exists(path) else path
         return cls(resolved, _version_in_name(resolved) or _version_in_name(path))
 
@@ -148,12 +151,12 @@ def _find_as_loader(name: str) -> str | None:
 
 
 def _natural_order(path: str) -> list[object]:
-    """Sorting key that compares runs of digits as numbers, as Dr.Jit does."""
+    """A sorting key that compares runs of digits as numbers, as Dr.Jit does."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)]
 
 
 def default_library() -> Library | None:
-    """The library that Dr.Jit loads by its own search; ``None`` if it finds none."""
+    """The library that Dr.Jit's own search finds; ``None`` if it finds none."""
     wish = os.environ.get(VARIABLE)
     if wish:
         return Library.at(_find_as_loader(wish) or wish)
@@ -198,14 +201,15 @@ def cpu() -> tuple[str, frozenset[str]]:
     return entries.get("model name", platform.machine()), frozenset(flags.split())
 
 
-# ---------------------------------------------------------------- Do they work?
+# ---------------------------------------------------------------- Usability
 
 
 def fault(library: Library) -> str:
-    """Why Dr.Jit cannot use ``library``, as the end of a sentence about it; empty if it can.
+    """Why Dr.Jit cannot use ``library``, as the end of a sentence about the library; empty if it
+    can.
 
-    Old versions are refused. Else the stored result of a probe decides, if there is one. A version
-    that is unknown, or newer than :data:`NEWEST_TESTED`, is probed now.
+    Old versions are refused. For others, the stored result of a probe decides, if there is one. An
+    unknown version, or one newer than :data:`NEWEST_TESTED`, is probed now.
     """
     problem = version_fault(library.version)
     if problem or not library.path:
@@ -222,7 +226,8 @@ def fault(library: Library) -> str:
 
 
 def version_fault(version: tuple[int, ...]) -> str:
-    """Why Dr.Jit cannot use this version on this machine; empty if it can, or if unknown."""
+    """Why Dr.Jit cannot use this version on this machine; empty if it can, or if the version is
+    unknown."""
     if version and version[0] < 15:
         return f"is too old: Dr.Jit needs LLVM {OLDEST} or newer on this machine"
     if version and version[0] < OLDEST:
@@ -234,7 +239,7 @@ def version_fault(version: tuple[int, ...]) -> str:
 
 
 def cpu_fault() -> str:
-    """Why no LLVM library works on this CPU; empty if one may."""
+    """Why no LLVM library works on this CPU; empty if one may work."""
     flags = cpu()[1]
     if platform.machine() == "x86_64" and flags and "fma" not in flags:
         return "this CPU lacks the FMA instructions, which Dr.Jit's LLVM backend needs"
@@ -265,7 +270,7 @@ def probe(library: Library) -> str:
     """Runs a small kernel with ``library`` in another process, and stores the result in a file.
 
     Returns:
-        An empty string if the kernel returned the right numbers; else the reason, as in
+        An empty string if the kernel returned the right numbers; otherwise the reason, as in
         :func:`fault`.
     """
     key, verdicts = _cache_key(library), _read_cache()

@@ -1,6 +1,6 @@
 """Installs the libraries that Dr.Jit's LLVM backend needs, or prints a command that installs them.
 
-This module needs the standard library only, and is also a script::
+This module needs only the standard library, and is also a script::
 
     python -m mitsuba_ext.startup.llvm_install           # list the libraries found, and faults
     python -m mitsuba_ext.startup.llvm_install --ensure  # exit 0 if one works; else install one
@@ -19,7 +19,7 @@ import sys
 from . import llvm
 from .llvm import NEWEST_TESTED, OLDEST, VARIABLE, Library, candidates, cpu_fault, fault, probe
 
-#: A library that the wheel of Dr.Jit links to and minimal systems lack (drjit issue 484), and its
+#: A library to which Dr.Jit's wheel links and that minimal systems lack (drjit issue 484), and its
 #: package.
 _SYSTEM_LIBRARY, _SYSTEM_PACKAGE = "libatomic.so.1", "libatomic1"
 
@@ -36,7 +36,7 @@ def offered_packages() -> list[str]:
 
 
 def lacks_system_library() -> bool:
-    """Is libatomic missing, without which Dr.Jit's wheel cannot be imported?"""
+    """Whether libatomic is missing, without which Dr.Jit's wheel cannot be imported."""
     if sys.platform != "linux":
         return False
     try:
@@ -47,7 +47,7 @@ def lacks_system_library() -> bool:
 
 
 def install_command(with_llvm: bool = True) -> str:
-    """Tells a user how to install the missing libraries; a command is quoted with backticks."""
+    """Tells the user how to install the missing libraries; commands are quoted with backticks."""
     needed = [_SYSTEM_PACKAGE] if lacks_system_library() else []
     if shutil.which("apt-get"):
         if with_llvm:
@@ -72,7 +72,7 @@ def _as_root() -> list[str] | None:
 
 
 def ensure() -> Library | None:
-    """Finds a library that passes the probe; if there is none, installs one with apt.
+    """Finds a library that passes the probe; if none does, installs one with apt.
 
     Returns:
         The library that ``import mitsuba_ext`` will use; ``None`` if there is still none.
@@ -106,7 +106,7 @@ def _newest_that_works() -> Library | None:
 
 
 def _advice() -> str:
-    """What to do if no library works and :func:`ensure` installed none, in one sentence."""
+    """Says, in one sentence, what to do if no library works and :func:`ensure` installed none."""
     if cpu_fault():
         return f"Dr.Jit cannot compile for this CPU: {cpu_fault()}."
     if os.environ.get(VARIABLE):

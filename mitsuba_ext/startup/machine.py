@@ -1,4 +1,4 @@
-"""Versions of the software, and the machine, which a measurement depends on."""
+"""The software versions and the machine on which a measurement depends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..util.version import __version__
 
 
 def versions() -> dict[str, str]:
-    """Versions of the software on which the image depends, and the active variant."""
+    """The versions of the software on which images depend, and the active variant."""
     import drjit
     import mitsuba
     import numpy

@@ -1,8 +1,8 @@
-"""Hooks into the import of Dr.Jit and Mitsuba, whichever module imports them.
+"""Hooks into the import of Dr.Jit and Mitsuba, no matter which module imports them.
 
 Before Dr.Jit is imported, a hook chooses an LLVM library that works. After Mitsuba is imported,
-another one registers the plugins. ``import mitsuba_ext`` itself imports neither, because that takes
-most of a second, and commands that only print, such as ``mitsuba-ext list``, do not need them.
+another hook registers the plugins. ``import mitsuba_ext`` imports neither, because that takes most
+of a second, and commands that only print, such as ``mitsuba-ext list``, do not need them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .signals import signals_wait
 
 
 def prepare() -> None:
-    """Registers the plugins now if Mitsuba is imported already, else when it is imported.
+    """Registers the plugins: now if Mitsuba is already imported, otherwise when it is imported.
 
     Raises:
         InstallationError: Mitsuba is imported, and its version is not supported.
@@ -34,7 +34,7 @@ def prepare() -> None:
 def _register() -> None:
     from . import registry
 
-    mitsuba = sys.modules["mitsuba"]  # not the module that was executed: Mitsuba replaces it
+    mitsuba = sys.modules["mitsuba"]  # not the executed module, which Mitsuba replaces
     runtime.check_version(mitsuba.__version__)
     runtime.guard(mitsuba)
     runtime.ensure_two_threads()

@@ -2,8 +2,8 @@
 
 Docstrings have Mitsuba's form: a title underlined with dashes, a ``.. pluginparameters::`` list of
 name, type and description (which ends in ``(Default: …)``), and prose. A row named ``(Common
-parameters)`` stands for the list in the docstring of the base class, except for parameters that the
-plugin describes itself.
+parameters)`` stands for the list in the base class's docstring, except for parameters that the
+plugin itself describes.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Page:
 
 
 def read_page(file: Path) -> Page:
-    """The page of the plugin in ``file``, which is named like the file."""
+    """The page of the plugin in ``file``, whose name is the plugin's name."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    # One plugin class per file; a helper class does not have a parameter list
+    # A file has one plugin class; helper classes have no parameter list
     classes.sort(key=lambda node: _LIST not in _docstring(node))
     return _class_page(file, tree, classes[0]) if classes else parse_page(file.stem, "")
 
@@ -85,7 +85,7 @@ def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
     for parameter in page.parameters:
         if parameter.name == _COMMON:
             base = _base_class(file, tree, cls)
-            while _LIST not in _docstring(base[2]):  # a class between that adds no parameters
+            while _LIST not in _docstring(base[2]):  # an intermediate class that adds no parameters
                 base = _base_class(*base)
             common = _class_page(*base).parameters
             rows += [row for row in common if row.name not in own]
@@ -97,11 +97,11 @@ def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
 def _base_class(
     file: Path, tree: ast.Module, cls: ast.ClassDef
 ) -> tuple[Path, ast.Module, ast.ClassDef]:
-    """The file, its syntax tree and the definition of the base class, which ``file`` defines or
-    imports from this package.
+    """The base class, which ``file`` defines or imports from this package: its file, the file's
+    syntax tree, and the class definition.
 
     Raises:
-        ValueError: There is no such base class.
+        ValueError: The base class is not found.
     """
     bases = {base.id for base in cls.bases if isinstance(base, ast.Name)}
     for definition in tree.body:
@@ -125,7 +125,7 @@ def _docstring(cls: ast.ClassDef) -> str:
 
 
 def _parameters(lines: list[str]) -> list[Parameter]:
-    """Reads ``* - name``, ``- type``, ``- description``, each continued on indented lines."""
+    """Reads ``* - name``, ``- type`` and ``- description``, each continued on indented lines."""
     rows: list[list[str]] = []
     for line in lines:
         first = re.match(r"\s*\* - (.*)", line)
@@ -155,12 +155,12 @@ def _plain(text: str) -> str:
     text = re.sub(r"``([^`]*)``", r"\1", text)
     text = re.sub(r"(?<![\w|])\|(\w+)\|(?!\w)", r"\1", text)
     text = text.replace("\\infty", "∞")
-    # Stars are left in code, which is indented
+    # Stars remain in code, which is indented
     blocks = re.split(r"(\n{2,})", text)
     return "".join(block if block[:1].isspace() else _without_stars(block) for block in blocks)
 
 
 def _without_stars(text: str) -> str:
-    """reStructuredText without the marks of strong and emphasized words."""
+    """reStructuredText without strong and emphasis marks."""
     text = re.sub(r"\*\*(?=\S)(.+?)(?<=\S)\*\*", r"\1", text, flags=re.S)
     return re.sub(r"(?<![\w*])\*(?=[^\s*])([^*]+?)(?<=\S)\*(?![\w*])", r"\1", text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-#: For each folder of plugins, the function of Mitsuba that registers them.
+#: The Mitsuba function that registers the plugins of each folder.
 KINDS: dict[str, str] = {
     "integrators": "register_integrator",
     "emitters": "register_emitter",
@@ -29,6 +29,7 @@ def plugin_files(kind: str) -> list[Path]:
 
 
 def decision_names() -> list[str]:
-    """The plugins that are samplers to Mitsuba, but decisions of the walk to our integrators."""
+    """The plugins that Mitsuba treats as samplers and our integrators treat as decisions of the
+    walk."""
     files = plugin_files("samplers")
     return [path.stem for path in files if "(DecisionPlugin)" in path.read_text(encoding="utf-8")]

@@ -1,7 +1,7 @@
-"""The parameters of our plugins, from their pages; the error for a parameter that none of them
-reads.
+"""The parameters of our plugins, from their pages; the error for a parameter that a plugin does not
+read.
 
-Mitsuba, too, refuses parameters that a plugin did not read, but suggests no name.
+Mitsuba also refuses parameters that a plugin did not read, but suggests no name.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 
 @functools.cache
 def parameter_rows(name: str) -> list[Parameter]:
-    """The rows of the parameter table of a plugin of this package; none for other plugins."""
+    """The rows of a plugin's parameter table; none for plugins of other packages."""
     files = (file for kind in KINDS for file in plugin_files(kind) if file.stem == name)
     pages = [read_page(file) for file in files]
     return [row for page in pages for row in page.parameters]
 
 
 def parameter_names(name: str) -> list[str]:
-    """The parameters of a plugin of this package, from its page; none for other plugins."""
+    """The parameters on a plugin's page; none for plugins of other packages."""
     return [key for row in parameter_rows(name) for key in row.name.split(", ")]
 
 
 def unread(name: str, key: str, others: Sequence[str] = ()) -> str:
-    """Says of a plugin that it does not read a parameter, and what was probably meant.
+    """Says that a plugin does not read a parameter, and suggests the one that was probably meant.
 
     Args:
         name: The plugin.
         key: The parameter.
-        others: The parameters of a plugin that is not of this package, as far as they are known.
+        others: The known parameters of a plugin of another package.
     """
     ours = parameter_names(name)
     if key in ours:
@@ -58,7 +58,7 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
         props: The parameters that the scene gives.
 
     Raises:
-        ValueError: The plugin did not read one of them.
+        ValueError: The plugin did not read a parameter.
     """
     keys = props.unqueried()
     if not keys:
@@ -73,7 +73,7 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
 
 
 def _nameless(value: Any) -> str:
-    """Says of a nested plugin without a name that it cannot be used."""
+    """Says that a nested plugin without a name cannot be used."""
     what = getattr(value, "name", None) or value.class_name()
     if not hasattr(value, "technique"):
         return f'nothing here uses the nested "{what}": leave it out'
@@ -81,5 +81,5 @@ def _nameless(value: Any) -> str:
 
 
 def _names(decision: Any) -> str:
-    """The names with which a decision can be nested."""
+    """The names under which a decision can be nested."""
     return " or ".join(f'name="{slot}"' for slot in decision.technique.slots)

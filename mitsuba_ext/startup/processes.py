@@ -8,13 +8,13 @@ import sys
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module in another process, with the same packages as in this one.
+    """The command that runs a module in another process with the same packages.
 
-    It does not use ``python -m``, which searches the current folder first: another copy of this
-    package may be there.
+    It does not use ``python -m``, which searches the current folder first and may find another copy
+    of this package there.
 
     Args:
-        module: Full name of the module; it is executed as ``__main__``.
+        module: The full name of the module, which is executed as ``__main__``.
         arguments: Its command-line arguments.
     """
     paths = [os.fspath(path) for path in sys.path]  # a user may have added a Path
@@ -26,8 +26,8 @@ def python_command(module: str, *arguments: str) -> list[str]:
 
 
 def restart_in_utf8() -> None:
-    """Starts this command again in Python's UTF-8 mode, where file names have another encoding (as
-    with ``LC_ALL=C`` and ``PYTHONUTF8=0``): Mitsuba takes names in UTF-8 only."""
+    """Restarts this command in Python's UTF-8 mode if file names have another encoding (as with
+    ``LC_ALL=C`` and ``PYTHONUTF8=0``), because Mitsuba accepts only UTF-8 names."""
     is_utf8 = codecs.lookup(sys.getfilesystemencoding()).name == "utf-8"
     if is_utf8 or os.name != "posix" or not sys.executable:
         return

@@ -2,8 +2,8 @@
 
 A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/``, ``samplers/``, ``sensors/``
 or ``shapes/``.
-The file's name is the plugin's name in a scene, and the one class that the file defines and
-decorates with :func:`plugin` is what Mitsuba instantiates. Deleting the file removes the plugin.
+The file's name is the plugin's name in a scene. Mitsuba instantiates the one class in the file that
+is decorated with :func:`plugin`. Deleting the file removes the plugin.
 
 Mitsuba's base classes differ from variant to variant, so a class body binds to the variant that is
 active when it runs. The plugin files, and the files of :func:`variant_bound` classes, are therefore
@@ -27,13 +27,13 @@ from .plugin_parameters import refuse_unread
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: The modules of variant-bound base classes, each after those from which it derives.
+#: The modules of variant-bound base classes, each after the modules of its own base classes.
 _bases: list[str] = []
 
 _registered: set[str] = set()
 _registering = threading.RLock()
 
-#: The kinds of plugins whose methods kernels call, and their instances that are in memory.
+#: The kinds of plugins whose methods kernels call.
 _CALLED = ("emitters", "bsdfs", "shapes", "sensors")
 _alive: weakref.WeakSet[mi.Object] = weakref.WeakSet()
 
@@ -63,13 +63,13 @@ def variant_bound(cls: type) -> type:
 
 
 def is_any_called() -> bool:
-    """Is there a plugin of ours in memory whose methods kernels call? Dr.Jit traces the methods of
-    all objects of a kind, also of those in scenes that are not rendered."""
+    """Whether any of our plugins whose methods kernels call is in memory. Dr.Jit traces the methods
+    of all objects of a kind, even in scenes that are not rendered."""
     return len(_alive) > 0
 
 
 def install() -> None:
-    """Registers the plugins now, if a variant is active, and whenever one is selected later."""
+    """Registers the plugins now if a variant is active, and whenever one is selected later."""
     import mitsuba as mi
 
     mi.detail.add_variant_callback(lambda _old, new: _register(new))
@@ -78,7 +78,7 @@ def install() -> None:
 
 
 def _register(variant: str) -> None:
-    with _registering:  # another thread may select the variant, too
+    with _registering:  # another thread may also select the variant
         if variant not in _registered:
             _register_plugins(variant)
 
@@ -109,8 +109,8 @@ def _execute(module: str) -> None:
 
 
 def _register_refusals(variant: str) -> None:
-    """In a variant that our plugins do not support, registers their names with constructors that
-    raise an error which says so."""
+    """In a variant that our plugins do not support, registers constructors that raise an error
+    saying so."""
     import mitsuba as mi
 
     def refuse(name: str) -> Callable[[mi.Properties], None]:

@@ -1,4 +1,4 @@
-"""Checks Mitsuba's version and the LLVM library, so that a wrong one leads to a clear message.
+"""Checks Mitsuba's version and the LLVM library, so that unsuitable ones lead to a clear message.
 
 ``mitsuba_import.py`` calls these functions before and after the import of Dr.Jit and Mitsuba, and
 ``registry.py`` whenever a variant is selected.
@@ -27,8 +27,8 @@ SUPPORTED_VARIANTS: tuple[str, ...] = (
     "cuda_ad_spectral",
 )
 
-#: Versions of Mitsuba that the package works with: from the first up to, not including, the second
-#: (3.10 renames the parameters of meshes). ``pyproject.toml`` has the same range.
+#: The supported versions of Mitsuba: from the first up to, but not including, the second (3.10
+#: renames the parameters of meshes). ``pyproject.toml`` has the same range.
 MITSUBA_VERSIONS = ((3, 9, 1), (3, 10))
 
 
@@ -36,8 +36,8 @@ def choose_llvm() -> None:
     """Chooses an LLVM library that works, before Dr.Jit is imported.
 
     Sets ``DRJIT_LIBLLVM_PATH`` if the user has not set it and the library that Dr.Jit would load
-    does not work. A machine without a usable library is no error here: CUDA variants need none, and
-    :func:`check` refuses the others.
+    does not work. A machine without a usable library is not an error here: CUDA variants need none,
+    and :func:`check` refuses the others.
     """
     if sys.platform != "win32" and not os.environ.get(llvm.VARIABLE):
         default = llvm.default_library()
@@ -49,14 +49,14 @@ def choose_llvm() -> None:
 
 @contextlib.contextmanager
 def missing_library_is_named() -> Iterator[None]:
-    """Around the import of Dr.Jit: raises a clear error if a system library is missing.
+    """A context for the import of Dr.Jit that raises a clear error if a system library is missing.
 
     Raises:
-        InstallationError: The missing library, and how to install it.
+        InstallationError: A library is missing; the message says how to install it.
     """
     try:
         yield
-    except (ImportError, NameError) as error:  # NameError: by a fault in Dr.Jit's own message
+    except (ImportError, NameError) as error:  # NameError: a bug in Dr.Jit's own message
         from . import llvm_install
 
         if llvm_install.lacks_system_library():
@@ -69,18 +69,19 @@ def missing_library_is_named() -> Iterator[None]:
 
 def check_installed_version() -> None:
     """Calls :func:`check_version`, if Mitsuba is an installed package."""
-    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source, or missing
+    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source or missing
         check_version(metadata.version("mitsuba"))
 
 
 def check_version(found: str) -> None:
-    """Refuses versions of Mitsuba that the package does not work with.
+    """Refuses unsupported versions of Mitsuba.
 
     Args:
-        found: The version, e.g. ``"3.9.1"``. A pre-release counts as the release that it precedes.
+        found: The version, such as ``"3.9.1"``. A pre-release counts as the release that it
+            precedes.
 
     Raises:
-        InstallationError: Which versions work, and how to get one.
+        InstallationError: The version is unsupported; the message names supported ones.
     """
     numbers = tuple(map(int, re.findall(r"\d+", found)[:3]))
     if not MITSUBA_VERSIONS[0] <= numbers < MITSUBA_VERSIONS[1]:
@@ -94,7 +95,7 @@ def check_meshes(mesh: type) -> None:
         mesh: The class ``mi.Mesh`` of the active variant.
 
     Raises:
-        InstallationError: Which versions work, and how to get one.
+        InstallationError: The version is unsupported; the message names supported ones.
     """
     if not hasattr(mesh, "vertex_positions_buffer"):
         raise _wrong_version("a development build of a later one")
@@ -109,13 +110,14 @@ def _wrong_version(found: str) -> InstallationError:
 
 
 def check(variant: str) -> None:
-    """Refuses an LLVM variant where Dr.Jit's LLVM library does not work.
+    """Refuses an LLVM variant if Dr.Jit's LLVM library does not work.
 
     Args:
         variant: A name such as ``"llvm_ad_rgb"``. Variants that need no LLVM pass.
 
     Raises:
-        InstallationError: The library, why it does not work, and how to get one that does.
+        InstallationError: The library does not work; the message says why, and how to get one that
+            does.
     """
     if variant.startswith("llvm_"):
         problem = llvm_problem()
@@ -125,7 +127,7 @@ def check(variant: str) -> None:
 
 def ensure_two_threads() -> None:
     """Gives Dr.Jit a second thread on a machine with one core. With a single thread, Mitsuba 3.9.1
-    hangs when it reads or writes an EXR file, because the thread waits for itself."""
+    deadlocks when it reads or writes an EXR file, because the thread waits for itself."""
     drjit = sys.modules["drjit"]
     if drjit.thread_count() < 2:
         drjit.set_thread_count(2)
@@ -134,7 +136,7 @@ def ensure_two_threads() -> None:
 def guard(mitsuba: ModuleType) -> None:
     """If LLVM does not work, makes ``mi.set_variant`` raise the error of :func:`check`.
 
-    If Dr.Jit refuses a library, its own message says that there is none. If LLVM works,
+    Dr.Jit's own message about a refused library says that there is none. If LLVM works,
     ``mi.set_variant`` is not changed.
 
     Args:
@@ -179,7 +181,7 @@ def llvm_problem() -> str:
 
 def loaded_library() -> llvm.Library | None:
     """The LLVM library in this process, with the exact version if Dr.Jit knows it. If Dr.Jit could
-    load none: the file that ``DRJIT_LIBLLVM_PATH`` names.
+    not load one, the file that ``DRJIT_LIBLLVM_PATH`` names.
     """
     version = _loaded_version()
     try:

@@ -1,4 +1,4 @@
-"""Signals wait while native code is being imported."""
+"""Delays signals while native code is being imported."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def signals_wait() -> Iterator[None]:
-    """Within it, signals that Python would handle wait for the end. (An exception of a handler,
-    such as ``KeyboardInterrupt``, would be raised amid the initialisation of Dr.Jit or Mitsuba:
-    they make an ``ImportError`` of it, and may end the process.)"""
+    """A context in which signals that Python would handle wait until its end. (A handler's
+    exception, such as ``KeyboardInterrupt``, would be raised amid the initialisation of Dr.Jit or
+    Mitsuba, which turn it into an ``ImportError`` and may crash.)"""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
