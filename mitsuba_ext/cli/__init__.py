@@ -1,9 +1,9 @@
 """The command ``mitsuba-ext``, one file per subcommand.
 
-Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (an image with NaN or
-infinite pixels, a comparison in which an integrator failed or a reference was too noisy, a problem
-that the doctor found), 2 (bad input: one line on stderr), 130, 143 and 129 (Ctrl-C, SIGTERM and
-SIGHUP).
+Mitsuba's own command cannot load plugins written in Python. Exit codes: 0 (success), 1 (an image
+with NaN or infinite pixels, a comparison in which an integrator failed or a reference was too
+noisy, or a problem that the doctor found), 2 (bad input: one line on stderr), 130, 143 and 129
+(Ctrl-C, SIGTERM and SIGHUP).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 2
     register()
     try:
-        # Only if started from a shell, and not from Python, do comparisons run in worker processes
+        # Comparisons run in worker processes only if started from a shell, not from Python
         obj = SUPERVISED if arguments is None else None
         code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False, obj=obj)
     except click.Abort as error:
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _explained(error: click.ClickException) -> str:
-    """The message of click, with what a first user may not know."""
+    """Click's message, extended by hints for new users."""
     text = error.format_message()
     for kind, meant in (("integer", "whole number"), ("float", "number")):
         text = text.replace(f"valid {kind} range", meant)

@@ -1,5 +1,5 @@
-"""Candidates for the shell's completion: scenes, folders, variants, integrators and their
-parameters. Nothing here imports Mitsuba, which would take a second."""
+"""Candidates for shell completion: scenes, folders, variants, integrators and their parameters.
+This module does not import Mitsuba, which would take a second."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     import click
     from click.shell_completion import CompletionItem
 
-#: The type of a candidate that more text can follow: no space is written after it.
+#: The type of an incomplete candidate, after which no space is written.
 PART = "part"
 
-#: Parameters of Mitsuba's integrators that are true or false.
+#: The Boolean parameters of Mitsuba's integrators.
 _SWITCHES = ("hide_emitters", "use_spectral_mis", "srgb_primitives", "guiding_proj")
 
 
@@ -56,7 +56,7 @@ def filters(_context: click.Context, _option: Any, text: str) -> list[Completion
 
 
 def variants(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
-    """Mitsuba's variants, which are modules of it."""
+    """Mitsuba's variants, each of which is a module of the package."""
     spec = PathFinder.find_spec("mitsuba")
     found = []
     for folder in (spec.submodule_search_locations or ()) if spec else ():
@@ -125,7 +125,7 @@ def _parameters(name: str) -> dict[str, str]:
 
 
 def _innermost(text: str) -> tuple[str, str]:
-    """The text up to the last bracket that is still open, and what follows."""
+    """The text up to the last open bracket, and the text after it."""
     opened: list[int] = []
     for index, letter in enumerate(text):
         if letter == "[":
@@ -137,7 +137,7 @@ def _innermost(text: str) -> tuple[str, str]:
 
 
 def _last_parameter(text: str) -> tuple[str, str, str]:
-    """Parameters before the last comma outside of brackets, the comma, and the rest."""
+    """The parameters before the last comma outside brackets, the comma, and the rest."""
     depth, cut = 0, -1
     for index, letter in enumerate(text):
         depth += (letter == "[") - (letter == "]")

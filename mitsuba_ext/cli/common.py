@@ -1,4 +1,4 @@
-"""What the commands share: types of options, output to the terminal."""
+"""Option types and terminal output shared by the commands."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from . import candidates
 if TYPE_CHECKING:
     from rich.console import Console
 
-#: Exit code after Ctrl-C.
+#: The exit code after Ctrl-C.
 INTERRUPTED = 130
 
 MAX_SEED = 2**32 - 1
 
-#: The most threads of a process.
+#: The maximum number of threads of a process.
 MOST_THREADS = 1024
 
-#: Width of tables that are written to a file or a pipe.
+#: The width of tables written to a file or a pipe, in characters.
 _PIPE_WIDTH = 160
 
 
@@ -99,7 +99,7 @@ def scene_options(command: Callable) -> Callable:
         ),
         click.option(
             "--crop", type=Crop(), metavar="WxH+X+Y",
-            help="Render W by H pixels of the image, from the column X and the row Y on.",
+            help="Render W by H pixels of the image, starting at column X and row Y.",
         ),
         click.option(
             "--filter", "rfilter", default="", metavar="FILTER",
@@ -132,7 +132,7 @@ def scene_options(command: Callable) -> Callable:
 
 
 def executor_options(what: str, note: str = "") -> Callable:
-    """Adds the options ``--workers`` and ``--dask``, which say where to do ``what``."""
+    """Adds the options ``--workers`` and ``--dask``, which choose where ``what`` is done."""
 
     def decorator(command: Callable) -> Callable:
         dask = click.option(
@@ -158,7 +158,8 @@ def check_executor(workers: int | None, dask: str | None) -> None:
 
 
 def kernels_compiled() -> int:
-    """How many kernels were not in Dr.Jit's cache, so that this process had to compile them."""
+    """The number of kernels that were not in Dr.Jit's cache and that this process had to
+    compile."""
     import drjit as dr
 
     _launches, _loaded, compiled = dr.detail.launch_stats()
@@ -166,8 +167,8 @@ def kernels_compiled() -> int:
 
 
 def say(text: str, err: bool = True) -> None:
-    """Prints a line, on stderr or stdout. A terminal that was closed is ignored, so that the image
-    is still written and the exit code stays the same."""
+    """Prints a line, on stderr or stdout. A closed terminal is ignored, so that the image is still
+    written and the exit code stays the same."""
     with contextlib.suppress(OSError):
         click.echo(text, err=err)
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="K",
-    help="Runs of each integrator at each level, each with a seed of its own.",
+    help="Runs of each integrator at each level, each with a different seed.",
 )
 @click.option(
     "--reference", type=FilledPath(), metavar="FILE",
@@ -61,8 +61,8 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--reference-integrator", metavar="INTEGRATOR", shell_complete=candidates.integrators,
-    help="Integrator that renders the reference.  [default: path, or what sees what path misses in "
-    "the scene: volpath or volpathmis in media, bdpt for lights that no camera path finds]",
+    help="Integrator that renders the reference.  [default: path; if that misses light of the "
+    "scene: volpath or volpathmis in media, bdpt for lights that no camera path finds]",
 )
 @click.option(
     "--no-reference", is_flag=True,
@@ -77,13 +77,13 @@ if TYPE_CHECKING:
 @click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
     shell_complete=candidates.folders,
-    help="Folder for report.html, results.json, the images, and rendered references. Runs that it "
-    "holds are used again; they are only timed again where new runs are compared with them.",
+    help="Folder for report.html, results.json, the images, and rendered references. Stored "
+    "runs are reused, and timed again only if new runs are compared with them.",
 )
 @click.option(
     "--limit", type=click.FloatRange(min=0, min_open=True), metavar="S",
-    help="Seconds that a render may take, compilation included. An integrator that takes longer is "
-    "ended and reported as failed, and the rest goes on. References have no limit.",
+    help="Time limit of a render in seconds, including compilation. An integrator that takes "
+    "longer is stopped and reported as failed; the others continue. References have no limit.",
 )
 @executor_options("Render references", " Measured runs use one process.")
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
@@ -125,8 +125,8 @@ def compare(
     holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
     Ratios are relative to the first integrator.
 
-    A comma begins a parameter only where key= follows: "neepp:aovs=d:depth,a:albedo,grid=8" has two
-    parameters. Square brackets hold what is nested in an integrator, in the same form:
+    A comma begins a parameter only if key= follows: "neepp:aovs=d:depth,a:albedo,grid=8" has two
+    parameters. Square brackets hold nested plugins, in the same form:
     "variance:nested=[neepp:grid=8],batches=32".
     """
     from ..inputs.scenes import check_scene_file
@@ -201,7 +201,7 @@ def compare(
 def _reference_workers(
     executors: contextlib.ExitStack, workers: int | None, dask: str | None, plugins: tuple[str, ...]
 ) -> ReferenceWorkers | None:
-    """The workers that render references. ``executors`` shuts them down."""
+    """The workers that render references; ``executors`` shuts them down."""
     from ..long_renders.dask_cluster import dask_cluster
     from ..long_renders.divided_references import ReferenceWorkers
     from ..long_renders.workers import Workers, threads_of_each
@@ -217,7 +217,8 @@ def _reference_workers(
 
 
 def _has_trouble(scene: Mapping[str, Any]) -> bool:
-    """Did the scene or an integrator fail, or was the reference too noisy for an error?"""
+    """Whether the scene or an integrator failed, or the reference was too noisy to measure an
+    error."""
     return bool(scene["error"]) or any(
         item["error"] or any(level["refused"] for level in item["levels"])
         for item in scene["integrators"]

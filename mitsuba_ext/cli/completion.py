@@ -1,7 +1,7 @@
-"""Completion for shells: their scripts, and the answers to them.
+"""Shell completion: scripts for the shells, and the answers to their requests.
 
-It is click's, with two additions: candidates that no space follows, and integrators with ``:`` and
-``=`` in bash, which splits words at these characters.
+It extends click's completion in two ways: candidates without a following space, and integrators
+with ``:`` and ``=`` in bash, which splits words at these characters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from click.shell_completion import (
     split_arg_string,
 )
 
-#: The environment variable by which a shell asks for candidates, named after the command.
+#: The environment variable with which a shell requests candidates, named after the command.
 VARIABLE = "_MITSUBA_EXT_COMPLETE"
 
 _BASH = """\
@@ -106,7 +106,7 @@ def _cut(line: str, incomplete: str) -> str:
     """The part of the last word that bash treats as a separate word."""
     try:
         shlex.split(line)
-    except ValueError:  # within quotes, bash does not split words
+    except ValueError:  # bash does not split words within quotes
         return ""
     ends = [letter for letter in ":=" if letter in os.environ.get("COMP_WORDBREAKS", ":=")]
     return incomplete[: 1 + max((incomplete.rfind(letter) for letter in ends), default=-1)]

@@ -1,4 +1,4 @@
-"""``mitsuba-ext diff``: measures how far one image is from another."""
+"""``mitsuba-ext diff``: measures the difference between two images."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FIGURES = {
 }
 
 
-@click.command(short_help="Measure how far one image is from another.")
+@click.command(short_help="Measure the difference between two images.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for scripts.")
 @click.option(
     "-o", "--output", type=FilledPath(), metavar="FILE",
@@ -37,16 +37,16 @@ _FIGURES = {
 @click.argument("a", type=FilledPath(), metavar="A")
 @click.argument("b", type=FilledPath(), metavar="B")
 def diff(a: Path, b: Path, as_json: bool, output: Path | None) -> int:
-    """Measure how far the image A is from the reference B.
+    """Measure the difference of the image A from the reference B.
 
     Both can be EXR (R/G/B or mean, with or without variance; Y; one layer), PNG, JPEG, HDR, PFM, or
     NumPy arrays; all are compared as linear RGB. If B has a variance, it is subtracted from relMSE,
-    MSE and rMSE, but not from σ/μ and FLIP. Relative errors are relative to B. "trimmed" leaves out
-    the 0.1 % of the pixels with the largest errors.
+    MSE and rMSE, but not from σ/μ and FLIP. Relative errors are relative to B. "trimmed" omits the
+    0.1 % of pixels with the largest errors.
 
-    If both have a variance, z is the difference of the means of the images in standard deviations:
+    If both have a variance, z is the difference of the images' means in standard deviations:
     beyond ±4, one of them is probably biased. z assumes that pixels are independent. With a
-    reconstruction filter wider than a pixel they are not, and z is too large.
+    reconstruction filter wider than a pixel, they are not, and z is too large.
     """
     from ..images import image_files
     from ..startup import machine
@@ -126,7 +126,8 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
     differing = int(signed.any(axis=2).sum())
     y, x, channel = np.unravel_index(np.argmax(np.abs(signed)), signed.shape)
     if differing == 0:
-        # Also if both are black. The reference's variance must not be subtracted from an error of 0
+        # Zero even if both are black. The reference's variance must not be subtracted from an error
+        # of 0
         errors = metrics.Errors(**dict.fromkeys(_FIGURES, 0.0))
     else:
         try:
@@ -145,7 +146,7 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
 def _z_scores(
     image: _Image, reference: _Image, signed: np.ndarray
 ) -> list[float | None] | None:
-    """The difference of the means divided by its standard deviation, per channel."""
+    """The difference of the means, divided by its standard deviation, per channel."""
     if image.variance is None or reference.variance is None:
         return None
     mean = signed.mean(axis=(0, 1))
@@ -155,7 +156,7 @@ def _z_scores(
 
 
 def _record(image: _Image, reference: _Image, difference: _Difference) -> dict[str, object]:
-    """What ``--json`` prints. Unknown numbers are null: JSON has no NaN."""
+    """The output of ``--json``. Unknown numbers are null because JSON has no NaN."""
     x, y, channel = difference.largest_at
     noise = _noise(reference, difference)
     return {
@@ -231,7 +232,7 @@ def _print(image: _Image, reference: _Image, difference: _Difference) -> None:
 
 
 def _noise(reference: _Image, difference: _Difference) -> float | None:
-    """The relMSE that was subtracted."""
+    """The relMSE of the reference that was subtracted."""
     from ..images import metrics
 
     if difference.identical or reference.variance is None:

@@ -1,15 +1,15 @@
-"""``mitsuba-ext export-blender``: our integrators in the menus of the add-on mitsuba-blender.
+"""``mitsuba-ext export-blender``: adds our integrators to the menus of the add-on mitsuba-blender.
 
 The add-on makes its menus from ``engine/integrators.json``, a table of plugins::
 
     {"path": {"label", "description", "parameters": {
         "max_depth": {"label", "description", "type", "default", "min"}, …}}, …}
 
-Of the types that it knows, ours have ``integer``, ``float`` and ``boolean``. It knows no texts, and
-it writes each parameter of the table into the scene, also those that keep their default. Left out
-are therefore parameters that hold texts, and those that are refused unless another one is set.
-Integrators that nest others are left out as well (the add-on makes classes for each nesting), and
-``composed_prb``, which is for gradients.
+Of the add-on's types, our parameters have ``integer``, ``float`` and ``boolean``. The add-on does
+not support strings, and it writes every parameter of the table into the scene, even with its
+default value. The table therefore omits string parameters, and parameters that are refused unless
+another one is set. It also omits integrators that nest others (the add-on makes classes for each
+nesting) and ``composed_prb``, which is for gradients.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TYPES = {
     "boolean": "boolean",
 }  # fmt: skip
 
-#: The table needs it: the add-on selects it in new scenes.
+#: The entry of ``path``, which the table needs because the add-on selects it in new scenes.
 _PATH = {
     "label": "Path tracer",
     "description": "Mitsuba's own path tracer.",
@@ -82,7 +82,7 @@ def export_blender(output: Path | None) -> int:
 
 
 def blender_table() -> dict[str, dict[str, Any]]:
-    """The entries of our integrators that render images and nest no others."""
+    """The entries of our integrators that render images and do not nest others."""
     from ..startup import pages, plugin_folders
 
     found = [pages.read_page(file) for file in plugin_folders.plugin_files("integrators")]
@@ -121,12 +121,12 @@ def _parameter(name: str, row: Parameter, value: bool | int | float) -> dict[str
 
 
 def _is_conditional(row: Parameter) -> bool:
-    """Is the parameter refused, even with its default, unless another one is set?"""
+    """Whether the parameter is refused, even with its default value, unless another one is set."""
     return bool(re.search(r"^With [a-z]|only with |accepted only if ", row.description))
 
 
 def _default(row: Parameter) -> bool | int | float | None:
-    """The default as the table holds it; ``None`` if it is no single number or Boolean."""
+    """The default value for the table; ``None`` if it is not a single number or Boolean."""
     kind = _TYPES.get(row.type)
     if kind == "boolean":
         return {"true": True, "false": False}.get(row.default)
@@ -147,5 +147,5 @@ def _read(file: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: cannot be read as a table of integrators ({error})") from error
     if not isinstance(table, dict) or not all(isinstance(one, dict) for one in table.values()):
-        raise InputError(f"{file}: is no table of integrators: expected objects by name")
+        raise InputError(f"{file}: is not a table of integrators: expected objects by name")
     return {"path": _PATH, **table}

@@ -1,4 +1,4 @@
-"""The parameters of frames that a function of the user computes."""
+"""Parameters of frames, computed by a function of the user's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..util.errors import InputError
 
 
 class FrameParameters(NamedTuple):
-    """What a frame changes in a scene.
+    """The changes that a frame makes to a scene.
 
     Attributes:
         definitions: Values of the scene file's ``$name`` parameters.
@@ -25,15 +25,16 @@ class FrameParameters(NamedTuple):
 
 
 def load_function(text: str) -> Callable[[int], FrameParameters]:
-    """Loads the user's function, and wraps it into one from a frame's number to its parameters.
+    """Loads the user's function, and wraps it in a function that maps a frame's number to its
+    parameters.
 
     Args:
-        text: ``file.py:function`` or ``module:function``. The function returns a dict: keys with a
-            dot are those of ``mi.traverse``, others are ``<default>``s of the scene.
+        text: ``file.py:function`` or ``module:function``. The function returns a dict. Keys with a
+            dot are keys of ``mi.traverse``; others are ``<default>``s of the scene.
 
     Raises:
-        InputError: There is no such file or function. The wrapper raises it if the user's function
-            fails, or does not return such a dict.
+        InputError: The file or the function does not exist. The wrapper also raises it if the
+            user's function fails or does not return such a dict.
     """
     source, colon, name = text.rpartition(":")
     if not colon or not source or not name.isidentifier():

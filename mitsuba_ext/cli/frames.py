@@ -1,4 +1,4 @@
-"""Which images a call of ``render`` makes: one for each frame and sensor."""
+"""The images that a call of ``render`` makes: one for each frame and sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 from ..util.errors import InputError
 from .common import MAX_SEED
 
-#: The functions and constants of expressions, besides the number of the frame.
+#: The functions and constants available in expressions, besides the frame number.
 _FUNCTIONS = {
     **{name: value for name, value in vars(math).items() if not name.startswith("_")},
     "abs": abs, "min": min, "max": max, "round": round, "int": int,
@@ -33,7 +33,7 @@ class FrameRange(click.ParamType):
 
 
 class Sensors(click.ParamType):
-    """Numbers of sensors; an empty tuple for all of them."""
+    """Indices of sensors; an empty tuple for all sensors."""
 
     name = "sensors"
 
@@ -49,12 +49,12 @@ class Picture(NamedTuple):
     """One of the images.
 
     Attributes:
-        output: Its file.
+        output: The file of the image.
         definitions: Values of the scene's ``$name`` parameters.
-        sensor: The number of the sensor; ``None`` for the first.
+        sensor: The index of the sensor; ``None`` for the first.
         seed: Seed of the random numbers.
-        frame: The number of the frame; ``None`` if there are none.
-        name: The part of the file's name for its frame and sensor; empty for a single image.
+        frame: The frame number; ``None`` if there are no frames.
+        name: The part of the file name for its frame and sensor; empty for a single image.
     """
 
     output: Path
@@ -66,7 +66,7 @@ class Picture(NamedTuple):
 
     @property
     def unfinished(self) -> Path:
-        """The file of an image that is not finished."""
+        """The file of the unfinished image."""
         return self.output.with_name(f"{self.output.stem}.partial{self.output.suffix}")
 
 
@@ -78,13 +78,16 @@ def pictures(
 
     Args:
         output: The file, with ``#`` for each digit of the frame.
-        definitions: Values; with frames, ``{…}`` in a value is an expression of ``frame``.
-        sensors: Their indices. If there are several, file names contain them.
-        seed: Seed of frame 0. Frame n adds n: with equal seeds, noise would visibly stay in place.
-        frames: Their numbers; ``None`` for a single image.
+        definitions: Values of ``$name`` parameters; with frames, ``{…}`` in a value is an
+            expression of ``frame``.
+        sensors: The indices of the sensors. If there are several, file names contain them.
+        seed: The seed of frame 0. Frame n adds n, because with equal seeds, noise would visibly
+            stay in place.
+        frames: The frame numbers; ``None`` for a single image.
 
     Raises:
-        InputError: The file has no place for the frame, or an expression cannot be evaluated.
+        InputError: The file name has no place for the frame number, or an expression cannot be
+            evaluated.
     """
     if frames is not None and len(re.findall("#+", output.name)) != 1:
         raise InputError(f"{output}: needs a place for the number of the frame: image.####.exr")
@@ -107,9 +110,9 @@ def pictures(
 def _evaluated(text: str, frame: int) -> str:
     def value(match: re.Match) -> str:
         try:
-            # It is the user's own command line
+            # The expression is from the user's own command line
             return str(eval(match[1], {"__builtins__": {}, **_FUNCTIONS, "frame": frame}))
-        except Exception as error:  # it may raise anything
+        except Exception as error:  # the expression may raise anything
             raise InputError(f'"{text}": frame {frame}: {error}') from None
 
     return re.sub(r"\{([^{}]*)\}", value, text)

@@ -27,12 +27,12 @@ from .render_job import RenderJob
 from .reports import Report
 from .stopping import stopping
 
-#: With less than this share of the time that was asked for, that time is shown too.
+#: The fraction of the requested time below which the requested time is also shown.
 _USED = 0.8
 
 
 class Order(NamedTuple):
-    """The options that all images of a call have in common."""
+    """The options shared by all images of a call."""
 
     scene: Path
     specification: str | None
@@ -50,13 +50,14 @@ class Order(NamedTuple):
 
 
 def is_finished(order: Order, picture: Picture) -> bool:
-    """Is there nothing left to do for one of several images?"""
+    """Whether nothing is left to do for one of several images."""
     if not picture.output.exists():
         return False
     long = order.long
     if long is None or long.folder is None:
         return True
-    # This call may ask for more samples than the last one. For an error, the state must be loaded
+    # This call may request more samples than the last one. To check the error, the state must be
+    # loaded
     if long.until is not None:
         return False
     return not order.spp or CheckpointFolder(long.folder / picture.name).load().spp >= order.spp
@@ -69,16 +70,16 @@ def render_image(
     """Renders an image and returns the exit code.
 
     Args:
-        order: The options that all images of the call have in common.
+        order: The options shared by all images of the call.
         picture: The image to render.
         plugins: Modules to import, which register other plugins.
         report: Shows the progress and the end of the render.
         scenes: Keeps the loaded scene for the next image.
-        function: Returns, for the number of a frame, what the frame changes in the scene.
+        function: Returns the changes that the frame with a given number makes to the scene.
 
     Raises:
-        InputError: Something cannot be read, used or written. If there are samples already, their
-            image is written.
+        InputError: An input cannot be read or used, or a file cannot be written. If samples already
+            exist, their image is written.
     """
     output, definitions, sensor_index, seed = picture[:4]
     values, long = None, order.long
@@ -118,12 +119,12 @@ def render_image(
         target: Path, others: Mapping[str, np.ndarray] | None = None, is_final: bool = True
     ) -> None:
         layers = {**job.variance(), **(others or {})}
-        # The render waits while an unfinished image is written: do not compress it
+        # The render waits while an unfinished image is written, so do not compress it
         image_files.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
 
     def show(is_asked: bool) -> None:
         if is_asked or (long and long.folder):
-            # The file of a frame counts as finished if it exists, so this one has another name
+            # An existing file counts as a finished frame, so the unfinished image has another name
             write(picture.unfinished if order.is_one_of_many else output, is_final=False)
         if order.preview:
             image_files.write_film(order.preview, job.film, metadata())
@@ -166,14 +167,15 @@ def render_image(
             if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)
             if is_new:
-                # The render's kernels take longer to compile, and nothing can be printed meanwhile
+                # The render's kernels take longer to compile, and nothing can be printed in the
+                # meantime
                 report.note("compiling kernels (later renders like this one find them in a cache)")
             if order.denoise:
                 guides = render_guides(job.scene, job.sensor, seed)
             job.run(order.spp, order.seconds, show, report)
         except (KeyboardInterrupt, Exception) as error:
-            # After SIGHUP, showing progress on the closed terminal raises an OSError. What a signal
-            # interrupts while the scene is loaded, Mitsuba reports as an error of a plugin
+            # After SIGHUP, showing progress on the closed terminal raises an OSError. If a signal
+            # interrupts loading the scene, Mitsuba reports an error of a plugin
             is_of_signal = isinstance(error, OSError) or job is None or not job.has_image()
             if not isinstance(error, KeyboardInterrupt) and not (stop.is_asked and is_of_signal):
                 raise
@@ -217,11 +219,11 @@ def render_image(
             if job.failure:
                 raise job.failure
             return stop.exit_code
-    count = 0 if is_new else kernels_compiled() - compiled  # else it was printed above
+    count = 0 if is_new else kernels_compiled() - compiled  # otherwise it was printed above
     kernels = f"{count} kernel{'' if count == 1 else 's'}"
     remark = f" (compiled {kernels}: the next such render starts faster)" if count else ""
     asked = None if long else order.seconds
-    # Another number of samples would have taken longer than it should
+    # Time is left if more samples would have exceeded it
     of = f" of {asked:g}" if asked and job.seconds < _USED * asked else ""
     report.end(f"{output}: {job.spp} spp in {job.seconds:.1f}{of} s{remark}", costs, **figures)
     if job.failure:
@@ -230,5 +232,5 @@ def render_image(
 
 
 def _noisy(path: Path) -> Path:
-    """The file of the image before it is denoised."""
+    """The file of the image before denoising."""
     return path.with_name(f"{path.stem}.noisy.exr")

@@ -1,4 +1,4 @@
-"""A render in batches, which can be continued, divided among processes, and ended at a given error.
+"""A render in batches that can be continued, divided among processes, and ended at a given error.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from .reports import Report
 
 @dataclass(frozen=True)
 class LongOptions:
-    """How to render in batches.
+    """The options of a render in batches.
 
     Attributes:
-        folder: The folder in which the render is saved; ``None`` for none.
-        every: How often it is saved.
-        add: Samples per pixel in addition to those in the folder; ``None`` for none.
-        until: The relative error at which it ends; ``None`` for none.
-        workers: Number of processes that render; 0 for this one.
-        dask: The address of a Dask scheduler whose workers render; empty for none.
-        has_preview: Is the unfinished image shown every so often, also without a folder?
+        folder: The folder in which the render is saved; ``None`` if it is not saved.
+        every: The interval at which it is saved.
+        add: Samples per pixel to add to the samples in the folder; ``None`` for none.
+        until: The relative error at which the render ends; ``None`` for no such limit.
+        workers: The number of worker processes; 0 to render in this one.
+        dask: The address of a Dask scheduler whose workers render; empty without Dask.
+        has_preview: Whether the unfinished image is shown at this interval, even without a folder.
     """
 
     folder: Path | None = None
@@ -56,11 +56,11 @@ class LongJob:
     """A render in batches, and its progress.
 
     Attributes:
-        chosen: What is rendered.
+        chosen: The scene, integrator and sensor.
         integrator, name, parameters: The integrator, its name and its parameters.
-        scene, sensor: What it renders.
+        scene, sensor: The scene and the sensor that it renders.
         film: The film that holds the image.
-        is_interrupted: Did a signal or a failure end the render before its goal was reached?
+        is_interrupted: Whether a signal or a failure ended the render before it reached its goal.
         failure: The error that ended the render after its first batch, or that kept its last state
             from being saved; ``None`` if there was none.
         seconds: Wall clock time of the render.
@@ -71,7 +71,7 @@ class LongJob:
     ) -> None:
         """
         Args:
-            request, options: What to render, and how.
+            request, options: The image to render, and the options of the batches.
             scenes: Keeps the loaded scene for the next image.
 
         Raises:
@@ -96,13 +96,13 @@ class LongJob:
     def run(
         self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
     ) -> None:
-        """Renders, beginning with the samples that the folder holds.
+        """Renders, starting from the samples in the folder.
 
         Args:
-            spp: Samples per pixel of the whole image. Default: the number of the sampler, if
-                nothing else ends the render.
+            spp: Samples per pixel of the whole image. By default, the sampler's number if nothing
+                else ends the render.
             seconds: Time limit of this call.
-            write: Writes the image of the film. Its argument is true if a signal asked for it.
+            write: Writes the image of the film. Its argument is true if a signal requested it.
             report: Shows the progress.
 
         Raises:
@@ -169,7 +169,7 @@ class LongJob:
                         return interrupt.is_set()
 
                     is_reached = self._render.run(goal, is_stopped, executor, n)
-                if not state.done:  # stopped before a worker had finished a batch
+                if not state.done:  # stopped before any worker finished a batch
                     raise KeyboardInterrupt
             except InputError as error:  # the scheduler or too many workers were lost
                 if not state.done:
@@ -185,12 +185,12 @@ class LongJob:
             try:
                 self._folder.save(state)
             except OSError as problem:
-                # Go on: the disk may have room for the image, which is smaller
+                # Continue: the disk may have room for the image, which is smaller
                 problem = InputError(f"the render could not be kept: {problem}")
                 self.failure = self.failure or problem
 
     def _say_what_is_kept(self, spp: int | None, report: Report) -> None:
-        """Says that the render is continued, or that ``spp`` samples are there already."""
+        """Says that the render is continued, or that it already has ``spp`` samples."""
         folder, kept = self._options.folder, self._state.spp
         if spp is None or kept < spp:
             report.note(f"{folder}: continued from {kept} samples per pixel")
@@ -206,8 +206,8 @@ class LongJob:
     def _executor(
         self,
     ) -> Iterator[tuple[Executor | None, Callable[[], int], Callable[[], None]]]:
-        """The executor that renders, the number of its workers (which may change), and a function
-        that fails if they were lost."""
+        """The executor that renders, a function for the current number of its workers, and a
+        function that raises an error if they were lost."""
         if self._options.dask:
             with dask_cluster(self._options.dask) as (executor, check):
                 yield executor, executor.count, check
@@ -224,7 +224,7 @@ class LongJob:
 
     @property
     def spp(self) -> int:
-        """Samples per pixel in the image."""
+        """The number of samples per pixel in the image."""
         return self._state.spp
 
     def how_far(self) -> str:
@@ -232,14 +232,14 @@ class LongJob:
         return f"after {self.spp} of {goal} spp" if goal else f"after {self.spp} spp"
 
     def has_image(self) -> bool:
-        """Are there samples in the image?"""
+        """Whether the image has samples."""
         return bool(self._state.done)
 
     def is_complete(self) -> bool:
         return not self.is_interrupted
 
     def variance(self) -> dict[str, Any]:
-        """Channels with the variance of the image, by name."""
+        """The channels with the variance of the image, by name."""
         batches = self._state.images
         if batches is None or batches.count < 2:
             return {}
@@ -258,14 +258,14 @@ class LongJob:
 
     @property
     def totals(self) -> RenderTotals:
-        """The cost of the samples in the image, in whichever process they were rendered."""
+        """The cost of the samples in the image, over all processes that rendered them."""
         return self._state.totals
 
 
 @contextlib.contextmanager
 def _asked_to_keep() -> Iterator[Callable[[], bool]]:
-    """While active, SIGUSR1 asks to save the render after the running batch, and to go on. Yields a
-    function that returns whether it was received since the last call."""
+    """While active, SIGUSR1 requests saving the render after the running batch and continuing.
+    Yields a function that returns whether the signal was received since the last call."""
     asked: list[int] = []
 
     def take() -> bool:

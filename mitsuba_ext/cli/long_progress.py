@@ -14,10 +14,10 @@ class LongProgress:
     """Shows the samples, their speed, the error estimated from the batches, and the time left.
 
     Parameters:
-        report: Receives it as events.
-        bars: Show it on a terminal.
-        name: Name of the integrator.
-        pixel_count: Pixels of the image.
+        report: Receives the progress as events.
+        bars: Show the progress on a terminal.
+        name: The name of the integrator.
+        pixel_count: The number of pixels of the image.
     """
 
     def __init__(self, report: Report, bars: Progress, name: str, pixel_count: int) -> None:
@@ -27,7 +27,7 @@ class LongProgress:
         self._begin, self._speed = time.perf_counter(), Speed()
 
     def __call__(self, render: LongRender) -> None:
-        """Call it after each batch."""
+        """Shows the progress; called after each batch."""
         spp, error = render.state.spp, render.error
         text, samples, left = f"{self._name}, {spp} spp", None, None
         if (per_second := self._speed(spp)) is not None:

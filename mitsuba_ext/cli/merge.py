@@ -47,7 +47,8 @@ def merge(folders: Sequence[Path], output: Path) -> int:
             state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
-    # Made under another name first: an unfinished folder could be taken for the start of a render
+    # Made under a temporary name first, because an unfinished folder could be mistaken for the
+    # start of a render
     make_folder(output.parent)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as made:

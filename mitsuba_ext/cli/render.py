@@ -48,8 +48,8 @@ from .frames import FrameRange, Sensors, pictures
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
     help="Take as many samples as fit into S seconds of rendering. The first samples measure the "
     "speed, with Mitsuba's integrators and with those of ours that learn (whose kernels are then "
-    "compiled within S). With others, and with structured samplers, a few short renders do, which "
-    "take additional time.",
+    "compiled within S). With others, and with structured samplers, a few short renders measure "
+    "it, which takes additional time.",
 )
 @click.option(
     "--seed", type=click.IntRange(0, MAX_SEED), default=0, metavar="N",
@@ -57,13 +57,13 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "-s", "--sensor", "sensors", type=Sensors(), metavar="N,…|all",
-    help="Sensors to render, counted from 0. Several images are called NAME.sensorN.EXT. [default: "
+    help="Sensors to render, counted from 0. Several images are named NAME.sensorN.EXT. [default: "
     "the first]",
 )
 @click.option(
     "--frames", type=FrameRange(), metavar="A:B",
     help="Render the frames A to B, both included, to image.####.exr. In -D, {…} is an expression "
-    "of frame: -D 'angle={3.6 * frame}'. Frames that exist are skipped. Frame n has the seed N + "
+    "of frame: -D 'angle={3.6 * frame}'. Existing frames are skipped. Frame n has the seed N + "
     "n.",
 )
 @click.option(
@@ -74,8 +74,8 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR", shell_complete=candidates.folders,
-    help="A folder in which the render is saved. The same command continues it. Of several frames "
-    "or sensors, each has a folder in it.",
+    help="A folder in which the render is saved. The same command continues it. With several "
+    "frames or sensors, each has a subfolder.",
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
@@ -84,32 +84,31 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--preview", type=FilledPath(), metavar="FILE",
-    help="A second image, such as a .png, that shows the render while it grows: after the first "
-    "batch, and then each --every. Of several frames or sensors, it shows the one that is being "
-    "rendered.",
+    help="A second image, such as a .png, that shows the unfinished render: after the first batch, "
+    "and then each --every. With several frames or sensors, it shows the one being rendered.",
 )
 @click.option(
     "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
-    help="With --checkpoint: samples per pixel, in addition to those in the folder.",
+    help="With --checkpoint: samples per pixel to add to the samples in the folder.",
 )
 @click.option(
     "--until", type=click.FloatRange(min=0, min_open=True), metavar="RELMSE",
-    help="End when the relative error, estimated from the variance of the batches, is RELMSE. "
+    help="End when the relative error, estimated from the variance of the batches, reaches RELMSE. "
     "--spp and --time limit it.",
 )
 @executor_options("Render")
 @click.option(
     "--denoise", is_flag=True,
-    help="Denoise the image in the end, guided by the albedo and the normals of what the camera "
-    "sees. The image itself is kept in NAME.noisy.exr.",
+    help="Denoise the image at the end, guided by the albedo and the normals of visible surfaces. "
+    "The noisy image is kept in NAME.noisy.exr.",
 )
-@click.option("--quiet", is_flag=True, help="Show warnings and errors only.")
+@click.option("--quiet", is_flag=True, help="Show only warnings and errors.")
 @click.option(
     "--json", "as_json", is_flag=True,
-    help="Print JSON objects to stdout, one a line: events of progress, warnings, and the end.",
+    help="Print JSON objects to stdout, one per line: progress events, warnings, and the end.",
 )
 @click.option(
-    # With one thread, Mitsuba 3.9.1 hangs when it reads or writes an EXR file
+    # With one thread, Mitsuba 3.9.1 deadlocks when it reads or writes an EXR file
     "--threads", type=click.IntRange(2, MOST_THREADS), metavar="N",
     help="Threads of each process, from 2 to 1024.  [default: all cores, divided among --workers]",
 )
@@ -147,14 +146,14 @@ def render(
     """Render SCENE (an XML file) to an image.
 
     Ctrl-C, SIGTERM and SIGHUP end the render after the running pass and keep the image so far: in
-    FILE, or in NAME.partial.EXT if FILE exists already. A second signal, half a second later or
+    FILE, or in NAME.partial.EXT if FILE already exists. A second signal, half a second later or
     more, ends the process at once, unless the image is being written.
 
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
-    pass (64 per pixel or more, 16 for large images), not those of the whole render.
+    pass (64 per pixel or more, 16 for large images), not of the whole render.
 
     With --checkpoint, --until, --workers, --dask or --preview, all integrators render in batches:
-    independent renders with seeds of their own. An EXR then holds the variance of the image too.
+    independent renders with different seeds. An EXR then also holds the variance of the image.
     The other batches use what an integrator learns in the first one. SIGUSR1 saves the render after
     the running batch.
     """
@@ -178,7 +177,7 @@ def render(
         raise click.UsageError("--preview must be another file than --output")
     is_long = checkpoint or until or workers or dask or preview
     if spp is not None and seconds is not None and not is_long:
-        raise click.UsageError("--spp and --time exclude each other, but in a render in batches")
+        raise click.UsageError("--spp and --time exclude each other, except in a render in batches")
     order = Order(
         scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
         LongOptions(
@@ -188,7 +187,7 @@ def render(
         preview=preview, changes=SceneChanges(crop, rfilter, max_depth),
     )  # fmt: skip
     if order.is_one_of_many and add is not None:
-        raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
+        raise click.UsageError("--add is for one image: give --spp, the total of each image")
     if parameters is not None and frames is None:
         raise click.UsageError("--parameters needs --frames")
     # Before the first batch and after the last one, SIGUSR1 is ignored: there is nothing to save
@@ -198,8 +197,8 @@ def render(
         if parameters is not None:
             from .frame_parameters import load_function
 
-            select_variant(variant, plugins)  # the function may use types of Mitsuba
-            plugins = ()  # they are registered
+            select_variant(variant, plugins)  # the function may use Mitsuba types
+            plugins = ()  # already registered
             function = load_function(parameters)
         if sensors == ():
             sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
@@ -218,7 +217,7 @@ def render(
 
 
 def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
-    """The indices of the scene's sensors, as they are in the first of the frames."""
+    """The indices of the scene's sensors in the first frame."""
     from ..inputs.scenes import load_scene
 
     select_variant(variant, plugins)

@@ -1,5 +1,5 @@
-"""One render of a scene file: with Mitsuba's integrators in passes, with ours by their own
-``render()``."""
+"""A single render of a scene file: in passes with Mitsuba's integrators, by ``render()`` with
+ours."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class RenderJob:
     """The render of a scene by an integrator, and its progress.
 
     Attributes:
-        chosen: What is rendered.
+        chosen: The scene, integrator and sensor.
         integrator, name, parameters: The integrator, its name and its parameters.
-        scene, sensor: What it renders.
+        scene, sensor: The scene and the sensor that it renders.
         film: The film that holds the image.
-        is_interrupted: Did a signal end the render before all samples were taken?
-        failure: Always ``None``: after a failure, there is no image.
+        is_interrupted: Whether a signal ended the render before all samples were taken.
+        failure: Always ``None``, because a failed render leaves no image.
         seconds: Wall clock time of the render.
     """
 
@@ -48,14 +48,14 @@ class RenderJob:
     def run(
         self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
     ) -> None:
-        """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
-        fit into ``seconds``, and reports the progress. After Ctrl-C, a render in passes ends with
+        """Renders ``spp`` samples per pixel (by default, the sampler's number), or as many as fit
+        into ``seconds``, and reports the progress. After Ctrl-C, a render in passes ends with
         :attr:`is_interrupted` set; integrators that do not handle it raise ``KeyboardInterrupt``.
 
         Raises:
             InputError: The integrator cannot render this scene.
-            KeyboardInterrupt: Ctrl-C. :meth:`has_image` says whether the film holds samples,
-                :meth:`is_complete` whether it holds all of them.
+            KeyboardInterrupt: Ctrl-C was pressed. :meth:`has_image` says whether the film holds
+                samples, :meth:`is_complete` whether it holds all of them.
         """
         begin = time.perf_counter()
         forget_memory_peak()
@@ -81,7 +81,7 @@ class RenderJob:
             self.seconds = time.perf_counter() - begin
 
     def _can_plan(self) -> bool:
-        """Can the number of samples be computed from the time during the render?"""
+        """Whether the number of samples can be computed from the time during the render."""
         if self._passes is not None:
             return is_independent(self.sensor)
         return timing.plans_for_time(self.integrator, self.scene, self.chosen.sensor_index)
@@ -104,7 +104,7 @@ class RenderJob:
 
         def progress(done: float) -> None:
             if seconds is not None and self._passes is None:
-                # It knows only the fraction of more samples than it will take
+                # The reported fraction refers to more samples than will be taken
                 done = min(1.0, (time.perf_counter() - begin) / seconds)
             per_second = speed(done)
             left = (1 - done) / per_second if per_second else None
@@ -136,7 +136,7 @@ class RenderJob:
             timing.timed_render(self.integrator, self.scene, self._seed, spp or 0, index)
 
     def variance(self) -> dict[str, np.ndarray]:
-        """Channels with the variance of the image: none, as it is not known."""
+        """The channels with the variance of the image: none, because it is unknown."""
         return {}
 
     def about(self) -> dict[str, Any]:
@@ -157,8 +157,8 @@ class RenderJob:
 
     @property
     def spp(self) -> int | None:
-        """Samples per pixel in the image. ``None`` after an interruption of an integrator that does
-        not report them (neither Mitsuba's nor ours)."""
+        """The number of samples per pixel in the image. ``None`` if an interrupted integrator does
+        not report it (one neither Mitsuba's nor ours)."""
         report = self._passes or timing.own_statistics(self.integrator)
         if report is not None:
             return report.spp
@@ -172,13 +172,13 @@ class RenderJob:
         return f"after {self.spp}{wanted} spp"
 
     def is_complete(self) -> bool:
-        """Does the film hold all samples, as after a signal in the last pass? ``False`` for
+        """Whether the film holds all samples, as after a signal in the last pass. False for
         integrators that do not report it (neither Mitsuba's nor ours)."""
         report = self._passes or timing.own_statistics(self.integrator)
         return report is not None and report.passes > 0 and not report.interrupted
 
     def has_image(self) -> bool:
-        """Does the film hold samples?"""
+        """Whether the film holds samples."""
         if self._is_measuring:
             return False
         report = self._passes or timing.own_statistics(self.integrator)

@@ -1,4 +1,4 @@
-"""The output of a render while it runs, and in the end: for people, or for scripts."""
+"""The output of a render, during it and at its end, for people or for scripts."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from rich.progress import Progress, TextColumn
 from ..compare.progress import progress_bars
 from .common import say
 
-#: Smallest number of seconds between two events of progress.
+#: The minimum time between two progress events, in seconds.
 _PERIOD = 1.0
 
 
 class Report:
-    """Sentences and progress bars on the terminal, or events: JSON objects on stdout, one a line.
+    """Sentences and progress bars on the terminal, or events: JSON objects on stdout, one per line.
 
     Parameters:
-        is_quiet: Only warnings and errors.
-        as_json: Events instead of sentences and bars.
+        is_quiet: Whether to show only warnings and errors.
+        as_json: Whether to print events instead of sentences and bars.
     """
 
     def __init__(self, is_quiet: bool = False, as_json: bool = False) -> None:
@@ -36,7 +36,7 @@ class Report:
         self.image: dict[str, Any] = {}
 
     def note(self, text: str) -> None:
-        """Prints a sentence that needs no attention, on stderr."""
+        """Prints an informative sentence on stderr."""
         if not self._is_quiet and not self._as_json:
             say(text)
 
@@ -47,7 +47,7 @@ class Report:
             say(f"mitsuba-ext: warning: {text}")
 
     def progress(self, **figures: Any) -> None:
-        """An event of progress; figures that are ``None`` are left out."""
+        """Emits a progress event; figures that are ``None`` are omitted."""
         if self._as_json and not self._is_quiet and time.monotonic() - self._last >= _PERIOD:
             self._last = time.monotonic()
             self._event("progress", **self.image, **figures)
@@ -55,7 +55,7 @@ class Report:
     def end(
         self, text: str, details: Sequence[str] = (), is_interrupted: bool = False, **figures: Any
     ) -> None:
-        """Prints the last sentence or event. A quiet report leaves out the details."""
+        """Prints the last sentence or event. A quiet report omits the details."""
         if self._as_json:
             self._event("end", interrupted=is_interrupted, **figures)
         elif is_interrupted or not self._is_quiet:
@@ -63,8 +63,8 @@ class Report:
 
     @contextlib.contextmanager
     def bars(self) -> Iterator[Progress]:
-        """Progress bars, if a terminal shows them. Their tasks have the field ``left``, which is
-        the text of :func:`time_left`."""
+        """Progress bars, if a terminal shows them. Their tasks have the field ``left`` for the text
+        of :func:`time_left`."""
         column = TextColumn("{task.fields[left]}", markup=False)
         with progress_bars(column, is_shown=not self._is_quiet and not self._as_json) as bars:
             yield bars
@@ -106,7 +106,7 @@ class Report:
 
     def _event(self, event: str, **figures: Any) -> None:
         known = {key: value for key, value in figures.items() if value is not None}
-        with contextlib.suppress(OSError):  # as say() does
+        with contextlib.suppress(OSError):  # like say()
             click.echo(json.dumps({"event": event, **known}), file=self._events)
 
 
@@ -116,8 +116,8 @@ def time_left(seconds: float | None) -> str:
 
 
 class Speed:
-    """Measures the speed of a render, from one call to the next. The part before the first call is
-    not counted, because it may compile kernels."""
+    """Measures the speed of a render from one call to the next. The time before the first call is
+    excluded, because it may include compilation."""
 
     def __init__(self) -> None:
         self._first: tuple[float, float] | None = None
@@ -126,7 +126,7 @@ class Speed:
         """The progress per second; ``None`` while it is unknown.
 
         Args:
-            done: How much is done, in any unit.
+            done: The amount done, in any unit.
         """
         now = time.perf_counter()
         if self._first is None:

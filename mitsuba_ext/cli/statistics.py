@@ -1,4 +1,4 @@
-"""Describes in sentences what a render cost and learned."""
+"""Describes the cost of a render and what it learned, in sentences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def lines(
 
     Args:
         seeds: The seeds of the samples in the image.
-        versions: See :func:`~mitsuba_ext.startup.machine.versions`.
+        versions: The result of :func:`~mitsuba_ext.startup.machine.versions`.
     """
     names = ", ".join(map(str, seeds[:4])) + (", …" if len(seeds) > 4 else "")
     found = [

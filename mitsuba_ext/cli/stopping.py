@@ -15,9 +15,9 @@ from .common import INTERRUPTED, say
 
 
 class Stop(interrupts.InterruptHandler):
-    """Handles the first signal, and remembers it. Later signals are handled by the thread of
-    :func:`_watching`, which receives them at once. (Python calls this handler only after the native
-    code that is running has returned.)"""
+    """Handles the first signal, and remembers it. The thread of :func:`_watching` handles later
+    signals, which it receives at once. (Python calls this handler only after the running native
+    code has returned.)"""
 
     is_writing = False
 
@@ -27,25 +27,25 @@ class Stop(interrupts.InterruptHandler):
 
     @property
     def is_asked(self) -> bool:
-        """Was there a signal?"""
+        """Whether a signal was received."""
         return self.number is not None
 
     @property
     def exit_code(self) -> int:
-        """The exit code of a process that the signal ended."""
+        """The exit code of a process ended by the signal."""
         return INTERRUPTED if self.number is None else 128 + self.number
 
     def wait(self) -> None:
-        """From now on, signals are ignored, because the image is being written."""
+        """Makes further signals ignored, because the image is being written."""
         self.is_writing = True
 
 
 @contextlib.contextmanager
 def stopping() -> Iterator[Stop]:
-    """While active, the first signal raises ``KeyboardInterrupt``; during passes, after the running
-    one. A second signal ends the process at once, whatever code is running, but not after
-    :meth:`Stop.wait`. Signals within half a second count as one. Signals that were ignored before,
-    such as SIGHUP under ``nohup``, stay ignored."""
+    """While active, the first signal raises ``KeyboardInterrupt``; during passes, it does so after
+    the running one. A second signal ends the process at once, whatever code is running, but not
+    after :meth:`Stop.wait`. Signals within half a second count as one. Signals that were ignored
+    before, such as SIGHUP under ``nohup``, stay ignored."""
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -56,8 +56,8 @@ def stopping() -> Iterator[Stop]:
 
 @contextlib.contextmanager
 def _watching(stop: Stop) -> Iterator[None]:
-    """Runs a thread that receives signals at once, even while native code runs and Python calls no
-    handler."""
+    """Runs a thread that receives signals at once, even while native code runs and Python cannot
+    call handlers."""
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
 

@@ -1,10 +1,10 @@
-"""Runs a comparison in a worker process, because an integrator can crash its process.
+"""Runs a comparison in a worker process, because an integrator can crash.
 
 Python cannot catch a lack of memory, a fault in native code, or an abort of LLVM. The supervisor
 records which integrator was rendering when the worker died, and starts another worker. The new
 worker finds the finished runs in the folder, reports that integrator as failed, and runs the rest.
 
-An integrator can hang, too: with a limit, the supervisor kills a worker whose render takes longer.
+An integrator can also hang: with a limit, the supervisor kills a worker whose render takes longer.
 
 Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the worker ends when the running
 render does. A second Ctrl-C kills it, and another worker writes the report of the finished runs.
@@ -31,20 +31,21 @@ from ..startup.processes import python_command
 from ..util import marks
 from .common import INTERRUPTED, say
 
-#: Value of the click context's ``obj`` in a process that was started from a shell.
+#: The value of the click context's ``obj`` in a process started from a shell.
 SUPERVISED = "supervised"
 
-#: Jobs of a worker: measure, or write the report of the stored runs.
+#: The jobs of a worker: measure, or write the report of the stored runs.
 MEASURE, STORED = JOBS = ("measure", "stored")
 
-#: Seconds in which a running render may finish after SIGTERM or SIGHUP. Batch systems kill after 10
-#: to 30 seconds, and the report takes a few.
+#: The time in which a running render may finish after SIGTERM or SIGHUP, in seconds. Batch systems
+#: kill after 10 to 30 seconds, and the report takes a few.
 GRACE = 3.0
 
-#: Exit codes of a worker that did not crash: success, failed integrators, bad input, interrupted.
+#: The exit codes of a worker that did not crash: success, failed integrators, bad input,
+#: interrupted.
 _IN_ORDER = (0, 1, 2, INTERRUPTED)
 
-#: Seconds between two checks for received signals.
+#: The time between two checks for received signals, in seconds.
 _POLL = 0.1
 
 _PR_SET_PDEATHSIG = 1
@@ -54,7 +55,7 @@ def supervise(arguments: Sequence[str], folder: Path, limit: float = math.inf) -
     """Runs ``mitsuba-ext`` with ``arguments`` in worker processes; returns the exit code.
 
     Args:
-        limit: Seconds that a render may take. A worker that takes longer is killed, and its
+        limit: The time limit of a render, in seconds. A worker that takes longer is killed, and its
             integrator is reported as failed.
 
     Raises:
@@ -110,13 +111,13 @@ def become_worker() -> None:
 
 
 class _End(NamedTuple):
-    """How a worker ended.
+    """The end of a worker.
 
     Attributes:
-        process: Its process id.
-        code: Its exit code; negative if a signal ended it.
-        signal: The signal that asked it to end; 0 if none did.
-        is_late: Was it killed because a render took too long?
+        process: The worker's process id.
+        code: The exit code; negative if a signal ended the worker.
+        signal: The signal that requested its end; 0 if none did.
+        is_late: Whether it was killed because a render took too long.
     """
 
     process: int
@@ -134,7 +135,7 @@ def _work(
 ) -> _End:
     """Runs a worker to its end. The first signal interrupts it, a second one kills it, and so does
     a render that takes longer than ``limit`` seconds."""
-    # In its own session, it does not get signals of the terminal, only those sent below
+    # In a separate session, the worker receives only the signals sent below, not the terminal's
     worker = subprocess.Popen(
         _command(arguments, job),
         start_new_session=True,
@@ -167,15 +168,15 @@ def _work(
                 deadline = time.monotonic() + GRACE
         if time.monotonic() > deadline:
             deadline = math.inf
-            if marks.running(folder, worker.pid):  # else it is writing the report
+            if marks.running(folder, worker.pid):  # otherwise it is writing the report
                 worker.kill()
 
 
 @contextlib.contextmanager
 def _collected_signals() -> Iterator[list[int]]:
-    """Collects the numbers of received signals in a list; of signals within half a second, only the
-    first. (If a signal raised an exception instead, this could happen at any time, even while
-    another one is handled.)"""
+    """Collects the numbers of received signals in a list; of several signals within half a second,
+    only the first. (An exception raised by a signal could occur at any time, even while another
+    exception is being handled.)"""
     received: list[int] = []
     first = -math.inf
 
@@ -188,7 +189,7 @@ def _collected_signals() -> Iterator[list[int]]:
 
     is_deaf = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     if is_deaf:
-        # Workers would inherit that SIGINT is ignored, but _work() interrupts them with it
+        # Workers would inherit an ignored SIGINT, with which _work() interrupts them
         signal.signal(signal.SIGINT, lambda *_: None)
     numbers = [n for n in interrupts.SIGNALS if not (is_deaf and n == signal.SIGINT)]
     try:

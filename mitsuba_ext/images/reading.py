@@ -79,7 +79,7 @@ def _read_channels(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]
         if bitmap.srgb_gamma():
             values = srgb_to_linear(values)
     elif not np.issubdtype(values.dtype, np.floating):
-        raise InputError(f"{path}: holds {values.dtype} values, which are no image")
+        raise InputError(f"{path}: holds {values.dtype} values, which are not an image")
     values = values.reshape(*values.shape[:2], -1).astype(np.float32)
     return {name: values[:, :, index] for index, name in enumerate(names)}, metadata
 
@@ -152,7 +152,7 @@ def _as_rgb(path: Path, name: str, array: np.ndarray) -> np.ndarray:
         array = array[:, :, None]
     if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.size == 0:
         shape = "x".join(map(str, array.shape))
-        raise InputError(f"{label}an array {shape} is no image (height, width[, 1, 3 or 4])")
+        raise InputError(f"{label}an array {shape} is not an image (height, width[, 1, 3 or 4])")
     with np.errstate(over="ignore"):  # overflow becomes infinity, which the metrics report
         array = array.astype(np.float32)
     return np.repeat(array, 3, axis=2) if array.shape[2] == 1 else array[:, :, :3]

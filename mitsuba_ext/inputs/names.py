@@ -56,7 +56,7 @@ def unknown_plugin(name: str, is_nested: bool = False) -> InputError:
     kind = "nested plugin" if is_nested else "integrator"
     if name in _ours(is_nested=True):
         return InputError(
-            f'"{name}" is no integrator, but a decision to be nested in one '
+            f'"{name}" is not an integrator, but a decision to be nested in one '
             f"('mitsuba-ext list {name}' shows how)"
         )
     hint = did_you_mean(name, [*_ours(is_nested), *MITSUBA_INTEGRATORS])

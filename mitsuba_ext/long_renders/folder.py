@@ -89,7 +89,7 @@ class CheckpointFolder:
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{file}: cannot be read ({error})") from None
         if not isinstance(description, dict):
-            raise InputError(f"{file}: is no description of a render")
+            raise InputError(f"{file}: is not a description of a render")
         return description
 
     def load(self, film: mi.Film | None = None) -> RenderState:
@@ -110,7 +110,7 @@ class CheckpointFolder:
                 state = RenderState.from_arrays(arrays, file.stat().st_size)
                 if _OF in arrays:
                     of = arrays.text(_OF)
-                    arrays.require(of == self._digest(), f"it is no state of {_DESCRIPTION}")
+                    arrays.require(of == self._digest(), f"it is not a state of {_DESCRIPTION}")
             except (DamagedError, OSError):
                 continue
             if film is not None and not state.fits(film):

@@ -185,7 +185,7 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
     with open(path, "rb", opener=_open_at_once) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise OSError("it is no regular file")
+            raise OSError("it is not a regular file")
         if most is not None and status.st_size > most:
             raise OSError(f"it has {status.st_size} bytes, more than {most}")
         return file.read()
