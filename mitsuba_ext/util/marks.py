@@ -233,5 +233,5 @@ def _opened(path: Path) -> TextIO:
     is_regular = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     if not is_regular or not re.fullmatch(r"\d{0,20}", file.read(32)):
         file.close()
-        raise InputError(f"{path}: is not a lock of this program: remove it, or name another folder")
+        raise InputError(f"{path}: is not our lock file: remove it, or name another folder")
     return file

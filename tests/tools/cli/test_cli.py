@@ -218,7 +218,7 @@ assert "rich" in sys.modules
     assert result.stdout.count("Usage:") == 2
     assert result.stderr.count('unknown integrator "neeep": did you mean "neepp"?') == 2
     assert 'nested plugin "guided_direction": did you mean "guided_directions"?' in result.stderr
-    assert '"learned_lights" is no integrator, but a decision to be nested in' in result.stderr
+    assert '"learned_lights" is not an integrator, but a decision to be nested in' in result.stderr
 
 
 def test_list_says_whose_plugin_a_name_is_or_what_it_may_have_meant(run):
