@@ -1,4 +1,5 @@
-"""Compares integrators by speed and error. A notebook does what ``mitsuba-ext compare`` does with::
+"""Compares integrators by speed and error. In a notebook, the equivalent of ``mitsuba-ext compare``
+is::
 
     import mitsuba_ext
     import mitsuba as mi

@@ -8,7 +8,8 @@ from numbers import Real
 
 from ..util.errors import InputError
 
-#: Samples per pixel that ``until`` starts with. With fewer, an integrator may have no pilot pass.
+#: The samples per pixel with which ``until`` starts. With fewer, an integrator may have no pilot
+#: pass.
 _FIRST_SPP = 8
 
 
@@ -31,11 +32,11 @@ class Budget:
 
     @property
     def target(self) -> float | None:
-        """The relMSE to reach, of ``until``."""
+        """The relMSE that ``until`` must reach; ``None`` for other budgets."""
         return self.values[0] if self.kind == "until" else None
 
     def level(self, index: int) -> float:
-        """The ``index``-th level; the levels of ``until`` double each time, without a last one."""
+        """The ``index``-th level; the levels of ``until`` double each time, without limit."""
         return _FIRST_SPP << index if self.kind == "until" else self.values[index]
 
     def __str__(self) -> str:
@@ -51,7 +52,7 @@ def equal_samples(spp: int) -> Budget:
 
 
 def equal_time(seconds: float) -> Budget:
-    """As many samples as ``seconds`` allow, learning included and compilation excluded."""
+    """As many samples as fit into ``seconds``, including learning but not compilation."""
     return Budget("time", (_positive(seconds, "seconds"),))
 
 
@@ -64,7 +65,8 @@ def sweep(counts: list[int] | tuple[int, ...]) -> Budget:
 
 
 def until(relmse: float) -> Budget:
-    """Samples are doubled, from 8 per pixel on, until the mean relMSE is at most ``relmse``."""
+    """Samples are doubled, starting with 8 per pixel, until the mean relMSE is at most
+    ``relmse``."""
     return Budget("until", (_positive(relmse, "relMSE"),))
 
 

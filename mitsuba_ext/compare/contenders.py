@@ -18,11 +18,11 @@ class Contender:
 
     Attributes:
         named: The integrator, its label, name and parameters.
-        runs: In the order in which they were measured.
-        compile_seconds: Time to compile or to load the kernels, without tracing.
-        error: Why there are no (more) runs; empty if all went well.
+        runs: Its runs, in the order in which they were measured.
+        compile_seconds: The time to compile or load the kernels, without tracing.
+        error: Why there are no (more) runs; empty if there was no error.
         traceback: The error's traceback, for authors of integrators.
-        notes: Sentences that a reader of the figures should know.
+        notes: Remarks for readers of the figures.
     """
 
     named: NamedIntegrator
@@ -31,9 +31,9 @@ class Contender:
     error: str = ""
     traceback: str = ""
     notes: list[str] = field(default_factory=list)
-    _zero_radiance: float | None = None  # measured here if the integrator does not count it
+    _zero_radiance: float | None = None  # measured separately if the integrator does not count it
     _pace: float | None = None  # seconds per sample per pixel
-    _plans: bool = False  # for the time of a run, by itself
+    _plans: bool = False  # whether it plans for the time of a run
     _is_prepared: bool = False
 
     @property

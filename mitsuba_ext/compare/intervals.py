@@ -1,7 +1,7 @@
 """Estimates with their 95 % confidence intervals over independent runs.
 
-Errors and times are positive and vary by factors. Their interval is therefore that of the mean of
-the logarithms (Student's t), applied as a factor around the estimate. With three runs t is 4.3, and
+Errors and times are positive and vary by factors. The confidence interval of the mean logarithm
+(Student's t) is therefore applied as a factor around the estimate. With three runs, t is 4.3, and
 the interval is wide.
 """
 
@@ -18,8 +18,8 @@ CONFIDENCE = 0.95
 
 
 class Estimate(NamedTuple):
-    """A value and its confidence interval; the bounds are ``None`` if they are unknown, as for a
-    single run."""
+    """A value and its confidence interval; the bounds are ``None`` if unknown, as for a single
+    run."""
 
     value: float
     low: float | None = None
@@ -27,12 +27,12 @@ class Estimate(NamedTuple):
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
-    """The mean of one value per run; ``None`` without values, or where one is not finite."""
+    """The mean of one value per run; ``None`` without values, or if one is not finite."""
     return _around(statistics.fmean, values)
 
 
 def median(values: Sequence[float]) -> Estimate | None:
-    """The median: for times, which other programs on the machine can only make longer."""
+    """The median, for times: other programs on the machine can only lengthen them."""
     return _around(statistics.median, values)
 
 
@@ -44,8 +44,8 @@ def ratio(
     Args:
         numerator, denominator: The estimates whose values are divided.
         pairs: One (numerator, denominator) for each round in which both ran. The interval comes
-            from their ratios: what two runs of a round share (the load of the machine, the seed)
-            cancels.
+            from their ratios, in which influences shared by two runs of a round (machine load,
+            seed) cancel.
     """
     if numerator is None or denominator is None or not denominator.value > 0:
         return None
@@ -85,7 +85,7 @@ def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate |
 
 def follow(at: Estimate | None, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
     """The y at an estimated x, on the line fitted to log y against log x. The line maps the
-    interval of x to that of y; the uncertainty of the line itself is ignored."""
+    interval of x to the interval of y; the uncertainty of the line itself is ignored."""
     fit = _log_fit(x, y)
     if at is None or fit is None:
         return None
@@ -125,8 +125,8 @@ def _around(center, values: Sequence[float]) -> Estimate | None:
         return None
     value = float(center(values))
     if min(values) <= 0:
-        # Zero and negative values (a share, a count, an error after a subtraction) have no
-        # logarithm: take the interval of the values themselves
+        # Zero and negative values (a fraction, a count, an error after a subtraction) have no
+        # logarithm: use the interval of the values themselves
         half = _half_width(values)
         return Estimate(value) if half is None else Estimate(value, value - half, value + half)
     return _with_factor(value, values)

@@ -8,11 +8,11 @@ from typing import Any
 
 
 class Results(dict):
-    """The content of ``results.json`` (:mod:`.results`): a dict that notebooks show as a table for
-    each scene, with small pictures.
+    """The content of ``results.json`` (:mod:`.results`), as a dict that notebooks show as a table
+    with thumbnails for each scene.
 
     Attributes:
-        folder: The folder of the comparison, whose images are shown.
+        folder: The folder of the comparison, which holds the images.
     """
 
     def __init__(self, content: Mapping[str, Any], folder: Path) -> None:

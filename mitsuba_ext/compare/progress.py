@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
-#: Without a terminal, smallest number of seconds between two lines.
+#: The minimum time between two lines without a terminal, in seconds.
 PERIOD = 30.0
 
 
 class Step(NamedTuple):
-    """The progress of a comparison; the argument of the function ``progress``.
+    """The progress of a comparison, passed to the function ``progress``.
 
     Attributes:
-        label: What is being done.
+        label: The current activity.
         done: Measured seconds of the finished renders.
-        left: Estimated seconds of the remaining ones; ``None`` if unknown.
+        left: Estimated seconds of the remaining renders; ``None`` if unknown.
     """
 
     label: str
@@ -33,8 +33,8 @@ class Step(NamedTuple):
 @contextlib.contextmanager
 def reporting(progress: bool | Callable[[Step], None]) -> Iterator[Callable[[Step], None]]:
     """Yields the function to call with each step: ``progress`` itself if it is a function. For
-    ``True``, a function that shows a bar with an estimate of the time left (without a terminal:
-    lines); for ``False``, one that does nothing."""
+    ``True``, a function that shows a bar with an estimate of the time left (lines, without a
+    terminal); for ``False``, a function that does nothing."""
     if callable(progress):
         yield progress
     elif not progress:
@@ -51,8 +51,8 @@ def progress_bars(*columns: ProgressColumn, is_shown: bool = True) -> Iterator[P
     """Progress bars on stderr, if that is a terminal.
 
     Args:
-        columns: Columns after the label, the bar and the elapsed time. Default: rich's estimate of
-            the remaining time.
+        columns: Columns after the label, the bar and the elapsed time. By default, rich's estimate
+            of the remaining time.
         is_shown: ``False`` hides the bars.
     """
     from rich import progress as bars

@@ -1,4 +1,4 @@
-"""Chooses the integrator of a reference by what the scene contains."""
+"""Chooses the integrator of a reference by the contents of the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..scene.movers import all_shapes
 from ..scene.unseen import has_unseen_shapes
 from ..startup.runtime import SUPPORTED_VARIANTS
 
-#: Lights that no ray hits, because they are points, or shine in a single direction.
+#: Lights that no ray hits because they are points or shine in a single direction.
 _UNHITTABLE = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
 
 
@@ -21,7 +21,7 @@ class ReferenceChoice(NamedTuple):
 
     Attributes:
         integrator: Its name.
-        remarks: Why it is not ``path``, and what light the reference lacks.
+        remarks: Sentences on why it is not ``path``, and which light the reference lacks.
     """
 
     integrator: str
@@ -29,8 +29,8 @@ class ReferenceChoice(NamedTuple):
 
 
 def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
-    """The integrator that renders the reference of a scene where the user names none: ``path``,
-    unless it does not see everything in the scene.
+    """The integrator that renders a scene's reference if the user names none: ``path``, unless it
+    cannot render everything in the scene.
 
     ===================================  ========================================================
     media                                ``volpath``, or ``volpathmis`` if their extinction is
@@ -62,7 +62,7 @@ def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
 
 
 def _lacks(missed: str, why: str) -> list[str]:
-    """What the reference does not show of the light that no camera path finds."""
+    """A remark on light missing from the reference because no camera path finds it."""
     lacks = f"the reference lacks light: no camera path finds {missed}, and {why}"
     return [lacks] if missed else []
 
@@ -73,7 +73,7 @@ def _missed_light(scene: mi.Scene, has_media: bool) -> str:
     unhittable = [each for each in flags if each & _UNHITTABLE]
     if any(each & mi.EmitterFlags.Surface for each in unhittable):
         return 'the light of "directionalarea"'
-    # Integrators for media see through index-matched surfaces when they connect to a light
+    # Integrators for media connect to lights through index-matched surfaces
     smooth = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
     smooth |= 0 if has_media else mi.BSDFFlags.Null
     bsdfs = (shape.bsdf() for shape in all_shapes(scene.shapes()))
@@ -83,7 +83,7 @@ def _missed_light(scene: mi.Scene, has_media: bool) -> str:
 
 
 def _takes_light_paths(loaded: LoadedScene) -> bool:
-    """Can ``bdpt`` render the scene, and connect light paths to its sensor?"""
+    """Whether ``bdpt`` can render the scene and connect light paths to its sensor."""
     if mi.variant() not in SUPPORTED_VARIANTS:
         return False
     scene = loaded.scene

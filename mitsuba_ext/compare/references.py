@@ -1,10 +1,10 @@
 """Reference images for measuring errors: read from files, or rendered once and stored.
 
-A rendered reference is the mean of independent batches, so that the variance of this mean is known.
-On disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean).
-An EXR with plain ``R/G/B`` is accepted too, with ``variance.R/G/B`` (which the integrator
-``variance`` writes) or without. Stored references hold a checksum: one that is damaged, or that an
-earlier version has written without one, is rendered anew.
+A rendered reference is the mean of independent batches, so the variance of this mean is known. On
+disk, it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean).
+An EXR with plain ``R/G/B`` is also accepted, with or without ``variance.R/G/B`` (which the
+integrator ``variance`` writes). Stored references hold a checksum: a reference that is damaged, or
+was written by an earlier version without a checksum, is rendered anew.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ from .reference_choice import choose_integrator
 if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
 
-#: Number of batches of a rendered reference. Their sample variance gives that of the reference.
+#: The number of batches of a rendered reference. Their sample variance gives the reference's
+#: variance.
 BATCH_COUNT = 16
 MIN_BATCH_COUNT = 8
 
-#: Seed of references; ``batch_seeds`` derives the seeds of the batches from it.
+#: The seed of references, from which ``batch_seeds`` derives the seeds of the batches.
 FIRST_SEED = 7_000_000
 
-#: Samples per pixel of the pilot from which the noise of a longer reference is extrapolated.
+#: The samples per pixel of the pilot from which the noise of a longer reference is extrapolated.
 _PILOT_SPP = 64
 
 _RGB = ("R", "G", "B")
@@ -51,15 +52,15 @@ _RGB = ("R", "G", "B")
 
 @dataclass
 class Reference:
-    """An image that is used as the exact solution.
+    """An image used as the exact solution.
 
     Attributes:
         mean: The image, array (height, width, 3).
         variance: Variance of ``mean``, same shape; ``None`` if unknown.
         path: The file that holds it.
         metadata: The metadata of that file.
-        fault: Why the file is not as this package wrote it (:func:`.image_files.fault_of`); empty
-            if it is.
+        fault: How the file differs from what this package wrote (:func:`.image_files.fault_of`);
+            empty if it does not.
     """
 
     mean: np.ndarray
@@ -70,12 +71,12 @@ class Reference:
 
     @property
     def noise(self) -> float | None:
-        """relMSE of the reference itself; ``None`` if its variance is unknown."""
+        """The relMSE of the reference itself; ``None`` if its variance is unknown."""
         return None if self.variance is None else metrics.reference_noise(self.mean, self.variance)
 
     @property
     def spp(self) -> int | None:
-        """Samples per pixel, ``None`` if the metadata does not give them."""
+        """The number of samples per pixel; ``None`` if the metadata does not give it."""
         spp = self.metadata.get("spp")
         return int(spp) if isinstance(spp, (int, float)) else None
 
@@ -132,14 +133,17 @@ def render_reference(
 
     Args:
         scene: The scene.
-        spp: Samples per pixel of all batches together; rounded up to a multiple of the batches.
-        folder: Where references are stored. It must exist.
-        integrator: The integrator that renders it; it must be unbiased. Default:
-            :func:`.reference_choice.choose_integrator`.
-        progress: Called after each batch with the fraction that is done.
-        enough: A stored reference with at least so many samples is used. Default: ``spp``.
-        workers: The workers that render it. Default: this process.
-        warn: Called with a sentence about each stored file that is damaged, and thus rendered anew.
+        spp: Samples per pixel of all batches together; rounded up to a multiple of the number of
+            batches.
+        folder: The existing folder in which references are stored.
+        integrator: The unbiased integrator that renders it. By default,
+            :func:`.reference_choice.choose_integrator` chooses it.
+        progress: A function that is called after each batch with the fraction done.
+        enough: The number of samples that a stored reference must have to be used. By default,
+            ``spp``.
+        workers: The workers that render it. By default, this process.
+        warn: A function that is called with a sentence about each damaged stored file, which is
+            rendered anew.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or
@@ -166,7 +170,7 @@ def render_reference(
 def stored_reference(
     scene: LoadedScene, folder: Path, integrator: Specification
 ) -> Reference | None:
-    """The reference with the most samples that ``folder`` holds for the scene, if any."""
+    """The stored reference of the scene with the most samples, if ``folder`` has one."""
     return _best_cached(folder, _identity(scene, make_named(integrator, scene.settings)))[0]
 
 
@@ -225,7 +229,7 @@ def _render(
 
 
 def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
-    """Everything that a reference depends on, its hash as ``key``, and a file name as ``stem``."""
+    """Everything on which a reference depends, its hash as ``key``, and a file name as ``stem``."""
     identity = {
         "scene": scene.source,
         "content_hash": scene.content_hash,
@@ -241,8 +245,8 @@ def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
 
 
 def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification) -> int:
-    """Samples per pixel (a power of two) after which a reference has at most the relMSE ``noise``,
-    extrapolated from a short pilot reference.
+    """The samples per pixel (a power of two) with which a reference has at most the relMSE
+    ``noise``, extrapolated from a short pilot reference.
 
     Raises:
         InputError: The pilot cannot be rendered, or is black.
@@ -254,7 +258,7 @@ def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specificatio
 
 
 def _unfinished(path: Path) -> Batches | None:
-    """The stored batches of an interrupted reference; ``None`` if there are none, or damaged."""
+    """The stored batches of an interrupted reference; ``None`` if they are missing or damaged."""
     try:
         return Batches.load(path)
     except Exception:  # zipfile, zlib and NumPy raise many kinds
@@ -264,8 +268,7 @@ def _unfinished(path: Path) -> Batches | None:
 def _best_cached(
     folder: Path, identity: Mapping[str, object]
 ) -> tuple[Reference | None, dict[Path, str]]:
-    """The stored reference with the most samples, and what is wrong with others: these are not
-    used."""
+    """The stored reference with the most samples, and the faults of unusable ones."""
     found, faults = [], {}
     for path in folder.glob(f"{glob.escape(str(identity['stem']))}_*spp.exr"):
         try:

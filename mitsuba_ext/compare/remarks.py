@@ -1,4 +1,4 @@
-"""Remarks for the reader of the figures: those that could not be measured, or may mislead."""
+"""Remarks on figures that could not be measured or may mislead."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from .experiment import TIME_TOLERANCE, Experiment
 from .references import Reference
 from .runs import Run
 
-#: A reference is too noisy to measure an error if its own relMSE is more than this share of that
-#: error.
+#: The maximum relMSE of a reference, as a fraction of the error that it is to measure.
 _NOISE_LIMIT = 0.5
 
-#: If relMSE is more than this multiple of the trimmed relMSE, a note warns of fireflies.
-_FIREFLIES = 1.5
+#: The ratio of relMSE to trimmed relMSE above which a note warns of fireflies.
+_FIREFLY_RATIO = 1.5
 
 
 def warnings(experiment: Experiment) -> list[str]:
@@ -40,7 +39,7 @@ def refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
     text = f"the reference is too noisy: its own relMSE is {noise:.2g}, "
     text += f"the error {error:.2g}" if error > 0 else "the error less than that"
     if reference.spp:
-        # Samples for a noise of 1/16 of the error, but at most 256 times as many as now
+        # Samples for a noise of 1/16 of the error, but at most 256 times the present number
         needed = reference.spp * 16 * noise / max(error, noise / 16)
         text += f"; needs --reference-spp {1 << math.ceil(math.log2(needed))}"
     return text
@@ -71,7 +70,7 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
 
 
 def _sessions(experiment: Experiment) -> Iterator[str]:
-    """Warnings about runs of different sessions."""
+    """Warnings about runs from different sessions."""
     first, *others = experiment.contenders
     all_runs = [run for contender in experiment.contenders for run in contender.runs]
     if len({run.session for run in all_runs}) < 2:
@@ -107,7 +106,7 @@ def _notes(experiment: Experiment, contender: Contender) -> Iterator[str]:
         errors = [run.errors for run in contender.at(level)]
         relmse = sum(e.relmse for e in errors)
         trimmed = sum(e.relmse_trimmed for e in errors)
-        if relmse > _FIREFLIES * trimmed > 0:
+        if relmse > _FIREFLY_RATIO * trimmed > 0:
             yield (
                 f"at {level:g} {'s' if budget.is_time else 'spp'}, 0.1 % of the pixels make up "
                 f"{1 - trimmed / relmse:.0%} of relMSE: its interval is too narrow; trimmed relMSE "

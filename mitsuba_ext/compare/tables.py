@@ -31,10 +31,11 @@ _LEGEND_BETWEEN_SEEDS = (
 )
 _LEGEND_CPU = " Seconds are CPU time of all threads."
 
-#: Width of the output to a file or a pipe.
+#: The width of the output to a file or a pipe, in characters.
 _PIPE_WIDTH = 160
 
-#: Smallest width of the labels; columns that do not fit beside them go to a further table.
+#: The minimum width of the labels, in characters; columns that do not fit beside them go to another
+#: table.
 _LABEL_WIDTH = 16
 
 
@@ -53,7 +54,7 @@ def show(results: Mapping[str, Any]) -> None:
 
 
 def tables(results: Mapping[str, Any], width: int = _PIPE_WIDTH) -> Iterator[Table | Text]:
-    """The parts that :func:`show` prints, laid out for ``width`` characters."""
+    """The parts printed by :func:`show`, laid out for ``width`` characters."""
     for scene in results["scenes"]:
         if scene["error"]:
             yield Text(f"{scene['name']}: {scene['error']}\n", style="red")
@@ -82,7 +83,7 @@ class _Column(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Including the two spaces before the column."""
+        """The width including the two spaces before the column."""
         return 2 + max(cell_len(text) for text in (self.heading, *self.cells))
 
 
@@ -122,8 +123,8 @@ def _columns(scene: Mapping[str, Any], results: Mapping[str, Any]) -> list[_Colu
 def _in_groups(
     columns: Sequence[_Column], labels: Sequence[str], width: int
 ) -> Iterator[list[_Column]]:
-    """The columns of each table: one table if all columns fit beside the labels; else separate
-    tables for errors and for costs, split further where needed."""
+    """The columns of each table: one table if all columns fit beside the labels, otherwise separate
+    tables for errors and for costs, split further if needed."""
     room = width - min(_LABEL_WIDTH, max(map(cell_len, labels), default=0))
     if sum(column.width for column in columns) <= room:
         yield list(columns)

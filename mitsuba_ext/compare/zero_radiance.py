@@ -1,4 +1,4 @@
-"""The share of camera samples with zero radiance, for integrators that do not count them."""
+"""The fraction of camera samples with zero radiance, for integrators that do not count them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Approximate number of samples. The standard error of the share is then at most 0.1 %.
+#: The approximate number of samples, for which the standard error is at most 0.1 %.
 _SAMPLES = 1 << 18
 
 
 def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -> float | None:
-    """The share of camera samples whose radiance is zero; ``None`` if the integrator cannot trace
-    single camera samples (a light tracer, or one for gradients)."""
+    """The fraction of camera samples with zero radiance; ``None`` if the integrator cannot trace
+    single camera samples (a light tracer, or an integrator for gradients)."""
     import drjit as dr
     import mitsuba as mi
 
@@ -33,6 +33,6 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
         sampler.seed(seed, width * height * spp)
         rays = camera.sample_rays(sensor, sampler, spp, spp, CameraSamples())
         L = integrator.sample(scene, sampler, rays.ray, None, mi.Bool(True))[0]
-    except Exception:  # sample() of another signature, a sampler that cannot be copied, …
+    except Exception:  # sample() has another signature, the sampler cannot be copied, …
         return None
     return float(dr.mean(dr.select(dr.max(dr.abs(L)) == 0, mi.Float(1), mi.Float(0)))[0])

@@ -1,8 +1,8 @@
-"""The report of a comparison: one HTML file with everything in it.
+"""The report of a comparison: one self-contained HTML file.
 
-It opens from the disk without a network, and can be sent to somebody as it is: images, plots,
-style sheet and script are inside. Its content comes from the folder that the comparison wrote
-(``results.json`` and the EXRs that it names), so that it can be written again at any time.
+It contains images, plots, style sheet and script, so it opens without a network and can be sent as
+it is. Its content comes from the comparison's folder (``results.json`` and the EXRs that it names),
+so it can be written again at any time.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ def write_report(folder: str | Path) -> Path:
     """Writes ``report.html`` next to ``results.json``, and returns its path.
 
     Args:
-        folder: The folder with the ``results.json`` of a comparison. The report names images that
-            are missing or damaged, and contains everything else.
+        folder: The folder with the ``results.json`` of a comparison. The report lists missing or
+            damaged images, and contains everything else.
 
     Raises:
         InputError: There is no ``results.json``, or it cannot be read.

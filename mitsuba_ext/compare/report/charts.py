@@ -1,4 +1,4 @@
-"""Which plots a scene gets, and their legends."""
+"""The plots of a scene, and their legends."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Chart:
     """A plot of the page.
 
     Attributes:
-        title: What it shows.
+        title: The title.
         svg: The plot.
-        legend: A line per integrator that is in the plot.
-        notes: Sentences about what is drawn, and what is not.
+        legend: A line per integrator in the plot.
+        notes: Sentences about what is and is not drawn.
     """
 
     title: str
@@ -41,8 +41,8 @@ class Chart:
 def make_charts(
     scene: Record, anchor: str, series_of: Mapping[str, int], target: float | None
 ) -> list[Chart]:
-    """Plots error against samples and against seconds; with a single level, against seconds
-    only."""
+    """Plots error against samples and against seconds; with a single level, only against
+    seconds."""
     found = levels(scene)
     axes = [("seconds", "seconds", ())]
     if len(found) > 1:

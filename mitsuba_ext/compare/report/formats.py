@@ -1,5 +1,5 @@
-"""Formats the numbers of the report: three significant digits, a unit, and the interval in the
-same unit."""
+"""Formats the numbers of the report: three significant digits, a unit, and the interval in that
+unit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-#: Maps a value to the factor it is divided by and the unit printed after it.
+#: Maps a value to the factor by which it is divided and the unit printed after it.
 Unit = Callable[[float], "tuple[float, str]"]
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -15,13 +15,13 @@ _NARROW_SPACE = "\u202f"
 
 
 class Text(NamedTuple):
-    """A figure as text. ``interval`` is empty if it is unknown."""
+    """A figure as text. ``interval`` is empty if unknown."""
 
     value: str
     interval: str = ""
 
 
-#: Text of an unknown figure.
+#: The text of an unknown figure.
 UNKNOWN = Text("–")
 
 
@@ -41,7 +41,7 @@ def number(value: float) -> str:
 
 
 def figure(estimate: Mapping[str, float | None] | None, unit: Unit) -> Text:
-    """A figure of ``results.json`` with its interval; both in the unit that suits the value."""
+    """A figure of ``results.json`` with its interval, both in the unit that suits the value."""
     if estimate is None or estimate["value"] is None:
         return UNKNOWN
     low, high = estimate.get("low"), estimate.get("high")
@@ -51,14 +51,14 @@ def figure(estimate: Mapping[str, float | None] | None, unit: Unit) -> Text:
     factor, _ = unit(estimate["value"])
     ends = number(low / factor), number(high / factor)
     if ends[0] == ends[1]:
-        return Text(value)  # a count that is the same in all runs, or nearly
+        return Text(value)  # a count that is equal, or nearly so, in all runs
     # "to" for negative bounds: a dash next to a minus sign would be hard to read
     dash = "–" if low >= 0 else " to "
     return Text(value, dash.join(ends))
 
 
 def short(value: float) -> str:
-    """A round number, such as those on an axis: 0.01 and not 0.0100, 10⁻⁵ and not 1·10⁻⁵."""
+    """A round number, as on an axis: 0.01 instead of 0.0100, 10⁻⁵ instead of 1·10⁻⁵."""
     factor, exponent = plain(value)
     text = f"{float(f'{value / factor:.2e}'):.10g}".replace("-", "−")
     return exponent[1:] if text == "1" and exponent else text + exponent
@@ -106,7 +106,7 @@ def count(value: float) -> tuple[float, str]:
 
 
 def _prefixed(value: float, *units: tuple[float, str]) -> tuple[float, str]:
-    """The largest unit in which ``value`` is at least 1. For the unit without prefix, 0.1 is
+    """The largest unit in which ``value`` is at least 1. For the unit without a prefix, 0.1 is
     enough."""
     for factor, unit in units:
         if abs(value) >= factor * (0.1 if factor == 1 else 1):

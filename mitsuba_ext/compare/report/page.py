@@ -34,7 +34,7 @@ _LEVELS = {
 
 @dataclass(frozen=True)
 class Crop:
-    """A window cut out of one picture; ``relmse`` is that of the window."""
+    """A window cut out of one picture; ``relmse`` is the relMSE within it."""
 
     picture: Picture
     image: str
@@ -43,7 +43,7 @@ class Crop:
 
 def render_page(results: Record, folder: Path) -> str:
     """The HTML of a report. Images are read from ``folder``."""
-    # In the order of their first appearance: each label has one colour on the whole page
+    # In order of first appearance: each label has one colour on the whole page
     labels = dict.fromkeys(one["label"] for s in results["scenes"] for one in s["integrators"])
     series_of = {label: index % len(plots.MARKERS) for index, label in enumerate(labels)}
     scenes = [
@@ -65,15 +65,15 @@ def render_page(results: Record, folder: Path) -> str:
         color_stops=_color_stops(),
         style=Markup((_FOLDER / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
-        # For the page's content security policy: only this script may run, and nothing may be
-        # loaded, even if a label or a message contains HTML
+        # For the page's content security policy: even if a label or a message contains HTML, only
+        # this script may run, and nothing may be loaded
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
 
 @cache  # compiles the templates once
 def environment() -> jinja2.Environment:
-    """The templates of this folder, and the filters that they use."""
+    """The templates in this folder, with the filters that they use."""
     import jinja2
 
     made = jinja2.Environment(
@@ -91,7 +91,7 @@ def environment() -> jinja2.Environment:
 
 
 def _breakable(label: str) -> Markup:
-    """A label with possible line breaks between its parts: ``neepp:`` ``max_depth=6,`` ``grid=8``.
+    """A label that can break between its parts: ``neepp:`` ``max_depth=6,`` ``grid=8``.
     """
     return Markup("<wbr>").join(re.split(r"(?<=[:,])", label))
 
@@ -221,8 +221,8 @@ def _color_stops() -> str:
 
 
 def _color_ticks(limits: tuple[float, float] | None) -> list[tuple[str, float]]:
-    """Text and position (in percent) of the colour bar's ticks: both ends, and the powers of ten
-    that are far enough from them."""
+    """The text and position (in percent) of the colour bar's ticks: both ends, and the powers of
+    ten that are far enough from them."""
     if limits is None:
         return []
     low, high = np.log10(limits)

@@ -1,7 +1,8 @@
-"""The images of a scene for the screen: all with one exposure, and error maps in one colour scale.
+"""The images of a scene for the screen: all with the same exposure, and error maps with the same
+colour scale.
 
-Every image is an 8-bit PNG of the size of the film, as ``data:`` URI. It is neither scaled down nor
-compressed with losses, which could be mistaken for errors of the integrator.
+Every image is an 8-bit PNG with the size of the film, as a ``data:`` URI. Scaling or lossy
+compression could be mistaken for errors of the integrator.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ EXPOSURE_TARGET = 0.8
 #: matplotlib's name of the colour map: perceptually uniform, and black for no error.
 COLOR_MAP = "inferno"
 
-#: The colour scale of the errors covers at most this many decades below its upper limit.
+#: The maximum number of decades that the colour scale of the errors covers.
 MAX_DECADES = 6
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
@@ -39,12 +40,12 @@ class Picture:
     Attributes:
         name: ``reference``, or the label of an integrator.
         integrator: The integrator's record; ``None`` for the reference.
-        run: The run whose image it is; ``None`` for the reference.
+        run: The run that rendered it; ``None`` for the reference.
         pixels: 8-bit sRGB, (height, width, 3).
-        image: ``pixels`` as URI.
+        image: ``pixels`` as a URI.
         error: Mean relative squared error of every pixel over ``run_count`` runs, (height, width);
             ``None`` without a reference.
-        error_map: ``error`` in colours, as URI; empty if ``error`` is ``None``.
+        error_map: ``error`` in colours, as a URI; empty if ``error`` is ``None``.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Pictures:
     Attributes:
         pictures: The reference, if there is one, then the integrators in their order.
         size: Width and height in pixels.
-        exposure: The factor that the linear values were multiplied by.
+        exposure: The factor by which the linear values were multiplied.
         limits: Errors at the ends of the colour scale; ``None`` without error maps.
         faults: Sentences about the files that could not be read.
     """
@@ -77,7 +78,8 @@ class Pictures:
 
 
 def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
-    """Reads the images of the scene's runs at ``level``; those of the first round are shown."""
+    """Reads the images of the scene's runs at ``level``; the images of the first round are
+    shown."""
     result = Pictures()
     reference = None
     if scene["reference"]:
@@ -87,8 +89,8 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
             result.faults.append(f"the reference is missing here: {error}")
     shape = None if reference is None else reference.shape
 
-    # One image per integrator stays in memory until the exposure is known: it comes from the
-    # reference, or else from the first image. Errors are summed run by run.
+    # One image per integrator stays in memory until the exposure is known, which comes from the
+    # reference or, without one, from the first image. Errors are summed run by run.
     waiting: list[tuple[Record, Record, np.ndarray, np.ndarray | None, int]] = []
     for integrator in scene["integrators"]:
         first, total, count = None, None, 0
@@ -145,9 +147,10 @@ def tone_map(pixels: np.ndarray, factor: float) -> np.ndarray:
 
 
 def relative_error(pixels: np.ndarray, reference: np.ndarray) -> np.ndarray | None:
-    """(I−R)² / (R² + ε) of every pixel, mean over its channels; ``None`` for a black reference.
+    """(I−R)² / (R² + ε) of every pixel, averaged over its channels; ``None`` for a black reference.
 
-    The reference's variance is not subtracted: the difference would be negative in many pixels.
+    The reference's variance is not subtracted because the difference would be negative in many
+    pixels.
     """
     floor = metrics.RELATIVE_FLOOR * reference.mean() ** 2
     if floor == 0:
@@ -156,9 +159,9 @@ def relative_error(pixels: np.ndarray, reference: np.ndarray) -> np.ndarray | No
 
 
 def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
-    """Limits of one logarithmic scale for several error maps. All but the smallest 2 % and the
-    largest 0.2 % of the pixels lie inside. The limits are rounded outwards to 1, 2 or 5 times a
-    power of ten."""
+    """The limits of a shared logarithmic scale for several error maps. They exclude the smallest 2
+    % and the largest 0.2 % of the pixels, and are rounded outwards to 1, 2 or 5 times a power of
+    ten."""
     if not errors:
         return None
     values = np.concatenate([error[error > 0] for error in errors])
@@ -172,7 +175,8 @@ def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
 def color_indices(error: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """Indices into :func:`color_table`, by the logarithm of the error."""
     low, high = np.log10(limits)
-    # high > low, as they are rounded outwards, to different numbers. The maximum avoids log10(0).
+    # high > low because both are rounded outwards, to different numbers. The maximum avoids
+    # log10(0)
     share = (np.log10(np.maximum(error, limits[0])) - low) / (high - low)
     return np.round(np.clip(share, 0, 1) * 255).astype(np.uint8)
 
@@ -185,7 +189,7 @@ def color_table() -> np.ndarray:
 
 
 def png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
-    """A PNG as ``data:`` URI; with a palette, ``pixels`` are its indices."""
+    """A PNG as a ``data:`` URI; with a palette, ``pixels`` are indices into it."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(pixels))
@@ -197,7 +201,7 @@ def png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
 
 
 def _read(path: Path, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """Reads an image in double precision; of a reference with a variance, the mean."""
+    """Reads an image (the mean of a reference with a variance) in double precision."""
     pixels = reading.read_image(path)[0].astype(np.float64)
     if shape is not None and pixels.shape != shape:
         sizes = [f"{width}x{height}" for height, width, _ in (pixels.shape, shape)]
@@ -208,7 +212,7 @@ def _read(path: Path, shape: tuple[int, ...] | None = None) -> np.ndarray:
 
 
 def _rounded(value: float, up: bool) -> float:
-    """The next 1, 2 or 5 times a power of ten."""
+    """The next 1, 2 or 5 times a power of ten, ``up`` or down."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = [power * step for step in (0.5, 1, 2, 5, 10, 20)]
     if up:

@@ -1,7 +1,7 @@
 """Error against cost on logarithmic axes, as SVG that takes its colours from the page.
 
 matplotlib draws in placeholder colours, which are then replaced by variables of the style sheet.
-The plot then fits a light and a dark page, and an integrator has the same colour everywhere. The
+The plot thus fits a light and a dark page, and an integrator has the same colour everywhere. The
 legend is part of the page, where it can wrap.
 """
 
@@ -18,24 +18,25 @@ from markupsafe import Markup
 
 from . import formats
 
-#: Marks of the integrators, for matplotlib and as text, so that colour is not needed to tell them
-#: apart.
+#: The marks of the integrators, for matplotlib and as text, so that integrators can be told apart
+#: without colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 GLYPHS = ("●", "■", "▲", "◆", "▼", "✚", "✖", "★")
 
 _INK, _GRID = "#010203", "#010204"
 _WIDTH, _HEIGHT = 5.6, 3.7  # inches; the page scales it
 
-#: Largest factor by which intervals may extend an axis beyond the points.
+#: The maximum factor by which intervals may extend an axis beyond the points.
 _INTERVAL_ROOM = 2.0
 
-#: Smallest ratio of an axis's ends, so that tiny differences do not fill the plot.
-_LEAST_SPAN = 2.0
+#: The minimum ratio of an axis's ends, so that tiny differences do not fill the plot.
+_MIN_SPAN = 2.0
 
 
 @dataclass(frozen=True)
 class Point:
-    """A level of an integrator: value, low and high; low and high are ``None`` for one run."""
+    """A level of an integrator: value, and bounds of the interval, which are ``None`` for one
+    run."""
 
     x: tuple[float, float | None, float | None]
     y: tuple[float, float | None, float | None]
@@ -46,10 +47,10 @@ class Series:
     """An integrator.
 
     Attributes:
-        index: Index of its colour and mark on the page.
+        index: The index of its colour and mark on the page.
         runs: Cost and error of every run.
         points: Means per level.
-        slope: Of the fitted line in the logarithms; ``None`` draws none.
+        slope: The slope of the line fitted to the logarithms; ``None`` draws none.
     """
 
     index: int
@@ -68,13 +69,13 @@ def plot(
     """Draws relMSE against a cost; ``None`` if there is nothing positive to draw.
 
     Args:
-        series: The integrators to draw. Values that are not positive are left out.
+        series: The integrators to draw. Values that are not positive are omitted.
         x_label: The name of the cost.
         name: A name for the plot that is unique on the page.
-        x_ticks: Where the x axis has its ticks; by default, chosen by the range.
+        x_ticks: The ticks of the x axis; by default, chosen by the range.
         target: The error to reach, drawn as a horizontal line.
     """
-    # Imported here, so that comparisons without a report do not wait for matplotlib; and not as
+    # Imported here so that comparisons without a report do not wait for matplotlib, and not as
     # pyplot, which would change the user's figures and backend
     import matplotlib
     from matplotlib.figure import Figure
@@ -158,12 +159,12 @@ def _ends(estimate: tuple[float, float | None, float | None]) -> list[float]:
 
 
 def _limits(values: Sequence[float], ends: Sequence[list[float]]) -> tuple[float, float]:
-    """The ends of an axis that shows all values, and those ends of intervals that are close."""
+    """The ends of an axis that shows all values, and the ends of intervals that are close."""
     low, high = min(values), max(values)
     for end in (end for pair in ends for end in pair):
         if low / _INTERVAL_ROOM <= end <= high * _INTERVAL_ROOM:
             low, high = min(low, end), max(high, end)
-    room = max(1.15, math.sqrt(_LEAST_SPAN * low / high), (high / low) ** 0.06)
+    room = max(1.15, math.sqrt(_MIN_SPAN * low / high), (high / low) ** 0.06)
     return low / room, high * room
 
 
@@ -195,9 +196,9 @@ def _placeholder(index: int) -> str:
 
 def _for_the_page(svg: str, name: str) -> str:
     """Makes an ``<svg>`` that can share an HTML page with others."""
-    svg = svg[svg.index("<svg") :]  # without the XML declaration and the DTD's address
+    svg = svg[svg.index("<svg") :]  # without the XML declaration and the DTD
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # This style would apply to the whole page; report.css has the same rules for the plots only
+    # This style would apply to the whole page; report.css has the same rules for plots only
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
     # matplotlib counts its ids from 1 in every figure
@@ -212,7 +213,7 @@ def _for_the_page(svg: str, name: str) -> str:
 
 
 _STYLE = {
-    "svg.fonttype": "none",  # text stays text: it can be selected, and takes the page's font
+    "svg.fonttype": "none",  # text stays text, which can be selected and has the page's font
     "font.size": 10.5,
     "text.color": _INK,
     "axes.edgecolor": _INK,

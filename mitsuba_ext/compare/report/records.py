@@ -1,7 +1,7 @@
-"""Reads ``results.json`` for the report: which runs belong together, and which level is shown.
+"""Reads ``results.json`` for the report, and chooses the runs and the level to show.
 
-A *level* is one size of a run: samples per pixel, or seconds. Integrators are compared at the same
-level only.
+A *level* is one size of a run: samples per pixel, or seconds. Integrators are compared only at the
+same level.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def read_results(folder: Path) -> Record:
     """The content of ``folder/results.json``.
 
     Raises:
-        InputError: The file is missing, is not JSON, or is of another schema.
+        InputError: The file is missing, is not JSON, or has another schema.
     """
     path = folder / "results.json"
     try:
@@ -44,8 +44,8 @@ def levels(scene: Record) -> list[float]:
 
 
 def main_level(scene: Record) -> float | None:
-    """The largest level that every integrator with runs has, so that the main table is fair; the
-    largest of all if there is no such level, ``None`` if nothing was measured."""
+    """The largest level that every integrator with runs has, so that the main table is fair;
+    without one, the largest of all; ``None`` if nothing was measured."""
     measured = [
         {level["level"] for level in integrator["levels"]}
         for integrator in scene["integrators"]
@@ -68,7 +68,7 @@ def runs_at(integrator: Record, level: float | None) -> list[Record]:
 
 
 def pictured_runs(integrator: Record, level: float | None) -> list[Record]:
-    """The runs whose images are shown: those of ``level``, or of the largest measured level if the
+    """The runs whose images are shown: runs of ``level``, or of the largest measured level if the
     integrator was stopped before ``level``."""
     runs = runs_at(integrator, level)
     if not runs and integrator["runs"]:
@@ -99,7 +99,7 @@ def _problems(scene: Record) -> Iterator[tuple[str, str]]:
         for note in integrator["notes"]:
             yield "warning", f"{label}: {note}"
         for level in integrator["levels"]:
-            # A note may contain the same text already
+            # A note may already contain the same text
             if level["refused"] and not any(level["refused"] in n for n in integrator["notes"]):
                 yield "warning", f"{label}: no errors at level {level['level']:g}: " + (
                     level["refused"]

@@ -1,4 +1,4 @@
-"""The short form of the report, for notebooks: a table for each scene, with small pictures."""
+"""The short form of the report, for notebooks: a table with thumbnails for each scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from .page import environment, level_name
 from .records import Record
 from .tables import Column
 
-#: Largest width and height of a picture. Its JPEG has about 10 kB, 30 kB if it is all noise.
+#: The maximum width and height of a thumbnail, in pixels. Its JPEG has about 10 kB, or 30 kB if it
+#: is all noise.
 THUMBNAIL = (160, 120)
 
 #: Headings of the columns that are not ratios.
@@ -26,11 +27,11 @@ _HEADINGS = {"time", "samples", "relMSE", "FLIP"}
 
 
 def render_summary(results: Record, folder: Path) -> str:
-    """HTML without styles and scripts of its own.
+    """HTML without styles and scripts.
 
     Args:
         results: The content of ``results.json``.
-        folder: Where its images are. Pictures of missing ones are left out.
+        folder: The folder of its images. Missing images are omitted.
     """
     scenes = [_scene(results, scene, folder) for scene in results["scenes"]]
     return environment().get_template("summary.html").render(
@@ -57,7 +58,7 @@ def _is_short(column: Column) -> bool:
 
 
 def _thumbnails(scene: Record, level: float | None, folder: Path) -> Iterator[tuple[str, str]]:
-    """The first image of each integrator, all with one exposure: pairs of label and URI."""
+    """The first image of each integrator, all with the same exposure: pairs of label and URI."""
     found: dict[str, np.ndarray] = {}
     for one in scene["integrators"]:
         for run in records.pictured_runs(one, level)[:1]:
@@ -79,7 +80,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def thumbnail(pixels: np.ndarray) -> str:
-    """A small JPEG of 8-bit sRGB as ``data:`` URI, less than 50 kB."""
+    """A small JPEG of 8-bit sRGB as a ``data:`` URI of less than 50 kB."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(pixels))

@@ -1,4 +1,4 @@
-"""Makes a table of the figures of one level; columns without figures are left out."""
+"""Makes a table of the figures of one level; columns without figures are omitted."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Column:
     """A column of the table.
 
     Attributes:
-        heading: Its heading.
-        unit: How its values are printed.
-        estimate: Function of an integrator and its level that returns the figure, or ``None``.
+        heading: The heading.
+        unit: The unit in which its values are printed.
+        estimate: A function of an integrator and its level that returns the figure, or ``None``.
         explanation: A tooltip.
         group: The common heading of this column and its neighbours.
     """
@@ -42,10 +42,10 @@ class Table:
     """A table: columns in groups, and a row of cells per integrator.
 
     Attributes:
-        groups: Heading and number of columns.
+        groups: The heading and the number of columns of each group.
         columns: The columns that are not empty.
         rows: An integrator of ``results.json`` and its cells; no cells if it was not measured.
-        unrecorded: Headings of the columns that were left out.
+        unrecorded: The headings of the omitted columns.
     """
 
     groups: list[tuple[str, int]]
@@ -64,7 +64,7 @@ def make_table(
 
     Args:
         target: The relMSE of ``until``; ``None`` for other budgets.
-        wanted: Which columns to make.
+        wanted: A function that says whether to make a column.
     """
     integrators = scene["integrators"]
     rows = [(integrator, at_level(integrator, level)) for integrator in integrators]

@@ -99,7 +99,7 @@ def test_what_is_no_lock_is_left_alone(tmp_path, make):
     mine.write_text("my text")
     folder.mkdir()
     make(folder / ".lock", mine)
-    with pytest.raises(InputError, match=r"\.lock: (cannot be used as|is no) "):
+    with pytest.raises(InputError, match=r"\.lock: (cannot be used as|is not) "):
         with marks.locked(folder):
             pass
     assert mine.read_text() == "my text" and os.path.lexists(folder / ".lock")
