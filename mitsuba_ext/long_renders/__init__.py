@@ -1,1 +1,2 @@
-"""Renders of many independent batches, which can be saved, continued, merged, and distributed."""
+"""Renders that consist of many independent batches and can be saved, continued, merged, and
+distributed."""

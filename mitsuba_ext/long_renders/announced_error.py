@@ -1,4 +1,4 @@
-"""Estimates the error of an image from the variance of its own batches."""
+"""Estimates the error of an image from the variance of its batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.ndimage import median_filter
 
 from ..images.metrics import RELATIVE_FLOOR
 
-#: Width, in pixels, of the neighbourhood from which the brightness of a pixel is estimated.
+#: The width of the neighbourhood from which a pixel's brightness is estimated, in pixels.
 _NEIGHBOURS = 3
 
 
@@ -16,8 +16,8 @@ def announced_error(mean: np.ndarray, variance: np.ndarray) -> float | None:
 
     The variance of a pixel is divided by the square of its brightness. The pixel's own value would
     be a bad estimate of its brightness: a firefly has a large variance, but also a large value, and
-    would hardly raise the error. The brightness is therefore the median over the neighbourhood of
-    the pixel. Pixels that are not finite are left out.
+    would hardly raise the error. The brightness is therefore the median over the pixel's
+    neighbourhood. Pixels that are not finite are omitted.
 
     Args:
         mean, variance: The image and the variance of this mean, [height, width, 3].

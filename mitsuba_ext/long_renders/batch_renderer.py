@@ -20,7 +20,7 @@ from .state import Batch, BatchResult
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What to render. It can be sent to other processes, and to other machines.
+    """A description of what to render, which can be sent to other processes and machines.
 
     Attributes:
         scene: The file.
@@ -31,12 +31,12 @@ class RenderRequest:
         seed: The seed of the random numbers.
         variant: Mitsuba's variant.
         plugins: Modules that register other plugins.
-        threads: Threads of a process; 0 for as many as there are cores.
-        values: Values of parameters of the loaded scene, from
+        threads: The number of threads of a process; 0 for the number of cores.
+        values: Values of the loaded scene's parameters, from
             :func:`~mitsuba_ext.inputs.scene_values.as_text`; ``None`` if no frame has any.
-        changes: The changes of the film and the depth.
-        description: Everything that the image depends on, as JSON. A process refuses the request if
-            its own files or versions give another description. Empty to skip this check.
+        changes: The changes to the film and the depth.
+        description: Everything on which the image depends, as JSON. A process refuses the request
+            if its files or versions give another description. Empty to skip this check.
     """
 
     scene: str
@@ -57,12 +57,12 @@ class BatchRenderer(IntegratorBatches):
     """Renders the batches of a request.
 
     Parameters:
-        request: What to render; its variant is the active one.
-        bundle: The scene's files; ``None`` to read them at their paths.
+        request: The request, whose variant is the active one.
+        bundle: The scene's files; ``None`` to read them from their paths.
         scenes: Keeps the loaded scene for the next render.
 
     Attributes:
-        request: What to render.
+        request: The request.
         chosen: The scene, the integrator and the sensor.
 
     Raises:
@@ -97,7 +97,7 @@ class BatchRenderer(IntegratorBatches):
         super().__init__(integrator, self.chosen.scene, self.chosen.sensor, request.seed)
 
     def description(self) -> dict[str, Any]:
-        """Everything that the image depends on, except the number of samples."""
+        """Everything on which the image depends, except the number of samples."""
         request, film = self.request, self.sensor.film()
         loaded, named = self.chosen.loaded, self.chosen.named
         folder = loaded.path.resolve().parent

@@ -1,4 +1,4 @@
-"""A scene with all its files, for machines that do not have them."""
+"""A scene with all its files, for machines without them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class Bundle:
     """The contents of files.
 
     Attributes:
-        files: Their contents, by their absolute paths on the machine that made the bundle.
+        files: The contents of the files, by their absolute paths on the machine that made the
+            bundle.
         folders: The folders in which Mitsuba searched for files on that machine.
         digest: SHA-256 over paths, contents and folders.
     """
@@ -38,7 +39,7 @@ class Bundle:
 
         Args:
             loaded: The scene.
-            others: More files, such as that of an integrator.
+            others: More files, such as an integrator's.
 
         Raises:
             InputError: A file has changed since the scene was loaded, or the scene names it by an
@@ -58,8 +59,8 @@ class Bundle:
             raise InputError(f"{loaded.source}: cannot be sent to the workers: {error}") from None
         if not is_same:
             raise InputError(f"{loaded.source}: its files have changed since the render began")
-        # The scene may be a link. Mitsuba opens names that its resolver does not find in the
-        # current folder
+        # The scene may be a link. Mitsuba searches the current folder for names that its resolver
+        # does not find
         searched = [loaded.path.resolve().parent, *mi.file_resolver(), os.curdir]
         folders = tuple(os.path.abspath(str(folder)) for folder in searched)
         return cls(files, folders, _digest(files, folders))
@@ -68,7 +69,7 @@ class Bundle:
     def unpacked(self) -> Iterator[Callable[[str], str]]:
         """A context in which the files are in a temporary folder, where Mitsuba finds them. Yields
         a function that maps the path of a file to its path there; it returns names that are not in
-        the bundle as they are.
+        the bundle unchanged.
 
         Raises:
             InputError: The bundle was damaged in transfer, or the disk has no room for it.
@@ -94,7 +95,7 @@ class Bundle:
                 resolver.prepend(str(root / os.path.relpath(folder, os.sep)))
             try:
                 yield moved
-            except InputError as error:  # show the original paths, without the temporary folder
+            except InputError as error:  # show the original paths instead of the temporary folder
                 raise InputError(str(error).replace(str(root), "")) from error
             finally:
                 for _ in self.folders:

@@ -17,10 +17,10 @@ from ..util.errors import InputError, InstallationError
 if TYPE_CHECKING:
     from distributed import Client
 
-#: Seconds for the scheduler to answer, and for a first worker to connect.
-_PATIENCE = 10
+#: The time limit for the scheduler to answer and for a first worker to connect, in seconds.
+_TIMEOUT = 10
 
-#: Seconds between two queries for the list of workers.
+#: The time between two queries for the list of workers, in seconds.
 _PERIOD = 5.0
 
 
@@ -34,7 +34,7 @@ class DaskWorkers(Executor):
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        # By default (pure), Dask would not run a failed batch again, but return its known result
+        # By default (pure), Dask would not run a failed batch again, but return the stored result
         self._executor = client.get_executor(pure=False)
         self._keys: weakref.WeakKeyDictionary[Future, str] = weakref.WeakKeyDictionary()
         self._avoided: set[str] = set()
@@ -51,11 +51,11 @@ class DaskWorkers(Executor):
         return future
 
     def share(self, value: Any) -> Any:
-        """Puts a value on one worker, from which the others fetch it."""
+        """Stores a value on one worker, from which the others fetch it."""
         return self._client.scatter([value], hash=False)[0]
 
     def avoid(self, future: Future) -> None:
-        """Gives no further tasks to the worker of this one until it is done."""
+        """Gives no further tasks to the worker of this task until the task is done."""
         key = self._keys.get(future)
         for address, keys in self._client.processing().items():
             if key in keys:
@@ -85,14 +85,14 @@ class DaskWorkers(Executor):
 @contextlib.contextmanager
 def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]]]:
     """A context with an executor that renders on a cluster, and a function that checks the
-    connection. Call the function now and then: without the scheduler, results never arrive. At the
-    end of the context, batches that have not begun are cancelled.
+    connection. Call the function periodically: without the scheduler, results never arrive. At the
+    end of the context, batches that have not started are cancelled.
 
     Args:
         address: The address of the scheduler: ``tcp://host:port``.
 
     Raises:
-        InputError: No scheduler answers, or it has no workers. The function raises it if the
+        InputError: No scheduler answers, or it has no workers. The function also raises it if the
             connection is lost.
         InstallationError: Dask is not installed.
     """
@@ -103,7 +103,7 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
             "--dask needs the package distributed: pip install 'mitsuba_ext[dask]'"
         ) from error
     try:
-        client = Client(address, timeout=_PATIENCE, set_as_default=False)
+        client = Client(address, timeout=_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"{address}: no Dask scheduler answers ({error})") from error
 
@@ -111,14 +111,14 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
         if client.status != "running":
             raise InputError(f"{address}: the Dask scheduler is gone")
 
-    # Tracebacks of lost connections, also in callbacks of Dask's event loop, which is Tornado's.
-    # Each of these loggers has a level of its own
+    # Silences tracebacks of lost connections, including those in callbacks of Dask's (Tornado's)
+    # event loop. Each of these loggers has a separate level
     for name in {"tornado.application", *logging.Logger.manager.loggerDict}:
         if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with client:
         try:
-            client.wait_for_workers(1, timeout=_PATIENCE)
+            client.wait_for_workers(1, timeout=_TIMEOUT)
         except TimeoutError:
             raise InputError(f"{address}: the Dask scheduler has no workers") from None
         executor = DaskWorkers(client)

@@ -1,4 +1,4 @@
-"""Distributes batches to workers, some of which may die or hang."""
+"""Distributes batches to workers that may die or hang."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from .state import Batch, BatchResult
 from .tasks import Missing, digest_of, render_batch
 from .workers import WorkerKilledError
 
-#: How many batches are submitted at a time, per worker.
+#: The number of batches submitted at a time, per worker.
 QUEUE = 2
 
-#: Seconds between two checks of the submitted batches.
+#: The time between two checks of the submitted batches, in seconds.
 _PERIOD = 1.0
 
-#: How often a batch may fail before the render ends with an error: by itself, and because its
-#: process was killed from outside. That says little about the batch, but the memory that it needs
-#: may be the reason, each time again.
-_TRIES, _KILLS = 3, 10
+#: The number of failures of a batch after which the render ends with an error: its own failures,
+#: and kills of its process from outside. A kill says little about the batch, but the memory that it
+#: needs may be the reason every time.
+_MAX_FAILURES, _MAX_KILLS = 3, 10
 
-#: A batch is late after the first number times the median time from submission to result, but not
-#: before the second number of seconds (a new worker loads the scene and compiles kernels). Before
-#: the first result, it is late after the third number of seconds.
-_LATE, _FIRST_LATE, _UNKNOWN_LATE = 5.0, 60.0, 600.0
+#: The time after which a batch is late: the first number times the median time from submission to
+#: result, but at least the second number of seconds (a new worker loads the scene and compiles
+#: kernels). Before the first result, it is the third number of seconds.
+_LATE_FACTOR, _MIN_LATE, _FIRST_RESULT_LATE = 5.0, 60.0, 600.0
 
-#: Number of the last results whose times give the median.
-_REMEMBERED = 101
+#: The number of recent results whose times give the median.
+_MEDIAN_COUNT = 101
 
 
 @dataclass
 class _Task:
-    """A batch that has been submitted to workers.
+    """A batch submitted to workers.
 
     Attributes:
-        given: When it was submitted last.
-        copies: How often it was submitted again because its result was late.
-        failures: How often it failed.
-        futures: The futures of all submissions that have not ended.
-        needs: The data that workers lacked, which the next submission contains.
+        given: The time of the last submission.
+        copies: The number of further submissions because its result was late.
+        failures: The number of failures.
+        futures: The futures of all unfinished submissions.
+        needs: The data that workers lacked, which the next submission includes.
     """
 
     given: float
@@ -65,12 +65,13 @@ class Dispatch:
 
     An executor may have two additional methods. ``share(value)`` returns a handle that can be sent
     to many workers in place of the value. ``avoid(future)`` gives no other tasks to the worker of
-    ``future`` until that is done.
+    ``future`` until the future is done.
 
     Parameters:
-        executor: Runs the workers. These need this package, but not the scene's files.
-        renderer: The render whose batches they render.
-        workers: Returns how many batches the executor renders at a time.
+        executor: The executor that runs the workers, which need this package, but not the scene's
+            files.
+        renderer: The renderer whose batches they render.
+        workers: A function that returns the number of batches that the executor renders at a time.
     """
 
     def __init__(
@@ -80,15 +81,15 @@ class Dispatch:
         workers: Callable[[], int],
     ) -> None:
         self._executor, self._renderer, self._workers = executor, renderer, workers
-        # Workers have another current folder, and their files may differ
+        # Workers have a different current folder, and their files may differ
         description = json.dumps(renderer.description(), default=str)
         self._request = replace(_absolute(renderer.request), description=description)
         self._tasks: dict[Batch, _Task] = {}
         self._running: dict[Future, Batch] = {}
-        # A queue, as ``concurrent.futures.wait`` takes milliseconds for thousands of futures
+        # A queue, because ``concurrent.futures.wait`` takes milliseconds for thousands of futures
         self._finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._looked = 0.0
-        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
+        self._seconds: deque[float] = deque(maxlen=_MEDIAN_COUNT)
         self._shared: dict[str, Any] = {}
         self._bundle: Bundle | None = None
 
@@ -102,9 +103,9 @@ class Dispatch:
 
         Args:
             batches: The batches to render.
-            learned: Returns the learned state that batches load; ``None`` until the first batch has
-                learned it, which is rendered alone.
-            is_stopped: Called while no result arrives: returns True to end.
+            learned: A function that returns the learned state that batches load; ``None`` until the
+                first batch, which is rendered alone, has learned it.
+            is_stopped: A function that is called while no result arrives, and returns True to end.
 
         Raises:
             InputError: A batch cannot be rendered.
@@ -150,7 +151,7 @@ class Dispatch:
     def _taken(
         self, future: Future, learned: bytes | None, is_stopped: Callable[[], bool]
     ) -> BatchResult | None:
-        """The result of a batch; ``None`` if there is none yet, or another copy was faster."""
+        """The result of a batch; ``None`` if there is none yet or another copy was faster."""
         batch = self._running.pop(future)
         task = self._tasks.get(batch)
         if task is None:  # a copy was faster
@@ -170,9 +171,10 @@ class Dispatch:
             return result
         self._shared.clear()  # the shared values may have been lost with a worker
         task.failures += 1
-        if is_stopped():  # the workers may have got the same signal
+        if is_stopped():  # the workers may have received the same signal
             return None
-        if task.failures >= (_KILLS if isinstance(failure, WorkerKilledError) else _TRIES):
+        was_killed = isinstance(failure, WorkerKilledError)
+        if task.failures >= (_MAX_KILLS if was_killed else _MAX_FAILURES):
             raise InputError(f"a batch failed {task.failures} times: {failure}") from failure
         if not task.futures:
             task.given = time.monotonic()
@@ -184,11 +186,11 @@ class Dispatch:
         if now - self._looked < _PERIOD:
             return
         self._looked = now
-        limit = _UNKNOWN_LATE
+        limit = _FIRST_RESULT_LATE
         if self._seconds:
-            limit = max(_FIRST_LATE, _LATE * statistics.median(self._seconds))
+            limit = max(_MIN_LATE, _LATE_FACTOR * statistics.median(self._seconds))
         for batch, task in self._tasks.items():
-            # The limit doubles with each copy, as the batch may be slow, and not its worker
+            # The limit doubles with each copy, because the batch may be slow rather than its worker
             if now - task.given > limit * 2**task.copies:
                 for future in task.futures:
                     getattr(self._executor, "avoid", lambda future: None)(future)
@@ -211,7 +213,7 @@ class Dispatch:
 
 
 def _absolute(request: RenderRequest) -> RenderRequest:
-    """The request with absolute paths of files, which are valid in any current folder."""
+    """The request with absolute file paths, which are valid in any current folder."""
 
     def absolute(name: str) -> str:
         path = Path(name)
@@ -224,7 +226,7 @@ def _absolute(request: RenderRequest) -> RenderRequest:
 
 
 def _failure(future: Future) -> BaseException | None:
-    """The error of a batch; ``None`` if it succeeded. Raises the error if it is about the input."""
+    """The error of a batch; ``None`` if it succeeded. Raises the error if it concerns the input."""
     if future.cancelled():
         return CancelledError("its worker is gone")
     error = future.exception()

@@ -18,13 +18,14 @@ from .state import Batch
 
 class ReferenceWorkers:
     """The workers that render the references of a comparison. They do not render the measured runs,
-    as times on different machines, or on shared cores, cannot be compared.
+    because times on different machines or on shared cores are not comparable.
 
     Parameters:
-        executor: Runs the workers: see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
-        count: How many batches it renders at a time.
+        executor: The executor that runs the workers; see
+            :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
+        count: The number of batches that it renders at a time.
         plugins: Modules that register other plugins.
-        threads: Threads of each process; 0 for as many as there are cores.
+        threads: The number of threads of each process; 0 for the number of cores.
     """
 
     def __init__(
@@ -44,16 +45,16 @@ class ReferenceWorkers:
         spp: int,
         batches: Batches | None,
     ) -> Iterator[Batches]:
-        """Yields the sum of the batches so far after each batch, like
+        """Yields the sum of all batches so far after each batch, like
         :func:`~mitsuba_ext.rendering.batches.each_batch`.
 
         Args:
             scene: The scene, from a file.
             specification: The integrator, as text.
             seed: The seed of the reference.
-            count, spp: Number of batches, those of ``batches`` included, and samples per pixel of
+            count, spp: The number of batches, including ``batches``, and the samples per pixel of
                 each.
-            batches: The first ones, if they have been rendered already; else ``None``.
+            batches: The first batches if already rendered; otherwise ``None``.
 
         Raises:
             InputError: The scene or the integrator cannot be sent, or a batch fails.
@@ -75,8 +76,8 @@ class ReferenceWorkers:
         dispatch = Dispatch(self._executor, renderer, lambda: self._count)
         index = batches.count if batches else 0
         waiting = (Batch(seed, number, spp) for number in range(index, count))
-        # Added in the order of their index, as an interrupted reference continues after the first
-        # ``batches.count``
+        # Added in the order of their indices, because an interrupted reference continues after the
+        # first ``batches.count``
         early = {}
         for result in dispatch.results(waiting, lambda: b"", lambda: False):
             early[result.batch.index] = result
@@ -88,7 +89,7 @@ class ReferenceWorkers:
 
 
 class _Loaded(LastScene):
-    """Returns a scene that has been loaded already."""
+    """Returns a scene that is already loaded."""
 
     def __init__(self, loaded: LoadedScene) -> None:
         self._given = loaded

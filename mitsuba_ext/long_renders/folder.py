@@ -18,36 +18,36 @@ from ..util.files import make_folder, replacing
 from ..util.stored_arrays import DamagedError
 from .state import RenderState
 
-#: Files: the description of what is rendered; the state; the state before it.
-_DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
+#: The files: the description of the render, the state, and the previous state.
+_DESCRIPTION, _STATE, _PREVIOUS_STATE = "render.json", "state.npz", "state.before.npz"
 
-#: The key of the hashes of the scene's files in a description, by their names. They only serve to
-#: name the file that has changed, as names can differ between machines.
-_FILES = "scene files"
+#: The key, in a description, of the hashes of the scene's files by name. They serve only to name
+#: the file that has changed, because names can differ between machines.
+_FILE_HASHES = "scene files"
 
-#: What a state is, and the version of its format.
-_FORM = "mitsuba_ext render 3"
+#: The kind of a state file and the version of its format.
+_FORMAT = "mitsuba_ext render 3"
 
-#: The array of a state that holds the digest of the description: a state that somebody has copied
-#: from another folder is not taken up.
-_OF = "description"
+#: The array of a state that holds the digest of the description, so that a state copied from
+#: another folder is rejected.
+_DESCRIPTION_DIGEST = "description"
 
-#: The most bytes of a description.
-_MOST_BYTES = 1 << 26
+#: The maximum size of a description, in bytes.
+_MAX_BYTES = 1 << 26
 
 
 class CheckpointFolder:
     """A folder with the state of a render, from which it can continue.
 
-    A new state replaces the old one in one step, and the state before it is kept. Whenever the
-    process ends, and for whatever reason, one of the two is undamaged.
+    A new state replaces the old one in one step, and the previous state is kept. Whenever and
+    however the process ends, one of the two is undamaged.
 
     Parameters:
         path: The folder, which is made if it is missing.
 
     Attributes:
         damaged: The file of the newest state, if :meth:`load` found it damaged and returned the
-            state before it; else ``None``.
+            previous state; otherwise ``None``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,14 +60,14 @@ class CheckpointFolder:
         return marks.locked(self.path)
 
     def describe(self, description: Mapping[str, Any]) -> None:
-        """Stores the description of what is rendered, or compares it with the stored one.
+        """Stores the description of the render, or compares it with the stored one.
 
         Raises:
             InputError: The folder belongs to another render.
         """
         file = self.path / _DESCRIPTION
         if not file.exists():
-            if any((self.path / name).exists() for name in (_STATE, _BEFORE)):
+            if any((self.path / name).exists() for name in (_STATE, _PREVIOUS_STATE)):
                 raise InputError(f"{file}: is missing: the folder cannot be used any more")
             with replacing(file) as temporary:
                 temporary.write_text(json.dumps(description, indent=1, default=str))
@@ -76,16 +76,16 @@ class CheckpointFolder:
         check_same(self.description(), json.loads(json.dumps(description, default=str)), self.path)
 
     def description(self) -> dict[str, Any]:
-        """The stored description of what is rendered.
+        """The stored description of the render.
 
         Raises:
-            InputError: There is none, or it is damaged.
+            InputError: The description is missing or damaged.
         """
         file = self.path / _DESCRIPTION
         if not file.exists():
             raise InputError(f"{self.path}: has no {_DESCRIPTION}: no render is kept here")
         try:
-            description = json.loads(archives.read_bytes(file, _MOST_BYTES))
+            description = json.loads(archives.read_bytes(file, _MAX_BYTES))
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{file}: cannot be read ({error})") from None
         if not isinstance(description, dict):
@@ -93,23 +93,23 @@ class CheckpointFolder:
         return description
 
     def load(self, film: mi.Film | None = None) -> RenderState:
-        """The newest state that is not damaged; an empty one if there is none.
+        """The newest undamaged state; an empty state if there is none.
 
         Args:
-            film: The film that the images must fit, and which is then filled; ``None`` for any.
+            film: The film that the images must fit and that is then filled; ``None`` for any.
 
         Raises:
             InputError: There are states, but all of them are damaged.
         """
-        found = [self.path / name for name in (_STATE, _BEFORE)]
+        found = [self.path / name for name in (_STATE, _PREVIOUS_STATE)]
         found = [file for file in found if file.exists()]
         for file in found:
             try:
-                arrays = archives.read(file, _FORM, f"{file}", "delete it")
-                # States are not compressed, so that they are not larger than their files
+                arrays = archives.read(file, _FORMAT, f"{file}", "delete it")
+                # States are not compressed, so they are no larger than their files
                 state = RenderState.from_arrays(arrays, file.stat().st_size)
-                if _OF in arrays:
-                    of = arrays.text(_OF)
+                if _DESCRIPTION_DIGEST in arrays:
+                    of = arrays.text(_DESCRIPTION_DIGEST)
                     arrays.require(of == self._digest(), f"it is not a state of {_DESCRIPTION}")
             except (DamagedError, OSError):
                 continue
@@ -128,24 +128,24 @@ class CheckpointFolder:
         """Saves a state.
 
         Raises:
-            OSError: It cannot be written; the state before it is still there.
+            OSError: The state cannot be written; the previous one still exists.
         """
         file = self.path / _STATE
         with replacing(file) as temporary:
             with temporary.open("wb") as stream:
-                arrays = {**state.arrays(), _OF: np.array(self._digest())}
-                archives.write_to(stream, _FORM, arrays, is_compressed=False)
+                arrays = {**state.arrays(), _DESCRIPTION_DIGEST: np.array(self._digest())}
+                archives.write_to(stream, _FORMAT, arrays, is_compressed=False)
                 stream.flush()
                 os.fsync(stream.fileno())
-            # A damaged state must not replace the one before it, which is not damaged
+            # A damaged state must not replace the undamaged previous one
             if file.exists() and self.damaged is None:
-                os.replace(file, self.path / _BEFORE)
+                os.replace(file, self.path / _PREVIOUS_STATE)
         self.damaged = None
 
     def _digest(self) -> str:
-        """That of the stored description; empty if there is none."""
+        """The digest of the stored description; empty if there is none."""
         try:
-            contents = archives.read_bytes(self.path / _DESCRIPTION, _MOST_BYTES)
+            contents = archives.read_bytes(self.path / _DESCRIPTION, _MAX_BYTES)
         except OSError:
             return ""
         return hashlib.sha256(contents).hexdigest()
@@ -157,11 +157,11 @@ def check_same(
     """
     Args:
         before, now: Descriptions of renders.
-        where: The name of ``before`` in the error message.
+        where: The name of ``before`` in error messages.
         free: Keys that may differ. The name of the scene's file may always differ.
 
     Raises:
-        InputError: They differ; the message names the difference.
+        InputError: The descriptions differ; the message names the difference.
     """
     if found := difference(before, now, free):
         raise InputError(
@@ -170,17 +170,17 @@ def check_same(
 
 
 def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence[str] = ()) -> str:
-    """A text about the first key in which two descriptions differ; empty if they are the same."""
+    """A text about the first key in which two descriptions differ; empty if they agree."""
     for key in dict.fromkeys([*before, *now]):
-        if key in ("scene", _FILES, *free) or before.get(key) == now.get(key):
+        if key in ("scene", _FILE_HASHES, *free) or before.get(key) == now.get(key):
             continue
         there, here = before.get(key), now.get(key)
         change = f"{there} there, {here} here"
-        if key == f"{_FILES} hash":
-            files = (d.get(_FILES) for d in (before, now))
+        if key == f"{_FILE_HASHES} hash":
+            files = (d.get(_FILE_HASHES) for d in (before, now))
             files = (f if isinstance(f, Mapping) else {} for f in files)
-            key, change = _FILES, _changed_files(*files)
-        elif key.endswith("hash"):  # its value would not help the user
+            key, change = _FILE_HASHES, _changed_files(*files)
+        elif key.endswith("hash"):  # the value would not help the user
             key = key.removesuffix("hash").strip()
             change = "its code has changed" if key == "integrator" else "it has changed"
         elif isinstance(there, Mapping) and isinstance(here, Mapping):

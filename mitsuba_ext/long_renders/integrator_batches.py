@@ -19,18 +19,18 @@ from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..util.errors import InputError
 from .state import Batch, BatchResult, image_shape
 
-#: Approximate number of samples in a batch of one of our integrators. Batches are this large
-#: because each one traces its kernels anew, and starts its Markov chains anew.
+#: The approximate number of samples in a batch of one of our integrators. Batches are this large
+#: because each traces its kernels and starts its Markov chains anew.
 _SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
 
-#: The fewest samples per pixel of a batch of one of our integrators: with an independent sampler,
-#: and with one that stratifies.
-_SPP, _STRUCTURED_SPP = 16, 64
+#: The minimum samples per pixel of a batch of one of our integrators: with an independent sampler,
+#: and with a stratified one.
+_MIN_SPP, _MIN_STRUCTURED_SPP = 16, 64
 
-#: More samples per pixel than a batch has.
-_ANY = 1 << 24
+#: A number of samples per pixel larger than in any batch.
+_LARGER_THAN_A_BATCH = 1 << 24
 
-#: Samples per pixel of the batch that learns for the others, if the render has as many.
+#: The samples per pixel of the batch that learns for the others, if the render has that many.
 _LEARNING_SPP = 128
 
 
@@ -38,14 +38,14 @@ class IntegratorBatches:
     """Renders batches.
 
     Parameters:
-        integrator, scene, sensor, seed: What to render.
+        integrator, scene, sensor, seed: The arguments of the render.
 
     Attributes:
         sensor, seed: The sensor and the seed.
-        learns: Does the integrator learn something that other batches can load?
+        learns: Whether the integrator learns a state that other batches can load.
 
     Raises:
-        InputError: The variant is a scalar one.
+        InputError: The variant is scalar.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class IntegratorBatches:
             )
         self._integrator, self._scene, self.sensor = integrator, scene, sensor
         self.seed = seed
-        # An integrator with save_learned or load_learned uses its own file for all batches
+        # An integrator with save_learned or load_learned uses this file for all batches
         self.learns = bool(
             getattr(integrator, "can_learn", False)
             and not integrator.save_learned
@@ -65,16 +65,16 @@ class IntegratorBatches:
         )
 
     def length(self, spp: int, teaches: bool) -> int:
-        """The samples per pixel of the next batch, out of ``spp`` that are missing. They do not
-        depend on the speed, so that the same command gives the same image.
+        """The samples per pixel of the next batch, out of ``spp`` missing ones. The number does not
+        depend on the speed, so the same command gives the same image.
 
         Args:
-            teaches: Do the batches after it use what it learns?
+            teaches: Whether later batches use what it learns.
         """
         if can_render(self._integrator):
             return min(pass_length(self.sensor), spp)
         limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
-        limit = max(limit, _SPP if is_independent(self.sensor) else _STRUCTURED_SPP)
+        limit = max(limit, _MIN_SPP if is_independent(self.sensor) else _MIN_STRUCTURED_SPP)
         if teaches:
             limit = max(limit, _LEARNING_SPP)
         return min(sample_count(self.sensor, 1 << (limit.bit_length() - 1)), spp)
@@ -82,8 +82,8 @@ class IntegratorBatches:
     def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
         """
         Args:
-            learned: What an earlier batch has learned; empty if there was nothing to learn;
-                ``None`` if this batch is the one that learns.
+            learned: The state learned by an earlier batch; empty if there was nothing to learn;
+                ``None`` if this is the batch that learns.
 
         Raises:
             KeyboardInterrupt: The batch was interrupted, and is lost.
@@ -107,10 +107,10 @@ class IntegratorBatches:
             return result
 
     def check(self, result: BatchResult) -> None:
-        """Checks the result of a batch that another process has rendered.
+        """Checks the result of a batch rendered by another process.
 
         Raises:
-            InputError: It is no image of this film.
+            InputError: The result is not an image of this film.
         """
         size, found = image_shape(self.sensor.film()), result.image.shape
         shapes = {found[:2], result.contents.shape[:2]}
@@ -125,8 +125,8 @@ class IntegratorBatches:
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
         forget_memory_peak()
         begin = time.perf_counter()
-        # Batches may be rendered in any order: the number counts as if all had the usual length
-        before = batch.index * max(batch.spp, self.length(_ANY, False))
+        # Batches may be rendered in any order: count as if all had the usual length
+        before = batch.index * max(batch.spp, self.length(_LARGER_THAN_A_BATCH, False))
         if hasattr(integrator, "samples_before"):
             integrator.samples_before = before
         try:

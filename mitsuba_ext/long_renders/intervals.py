@@ -1,4 +1,4 @@
-"""How often a render is saved."""
+"""The intervals at which a render is saved."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Interval:
-    """How often a render is saved: its period in seconds, or in samples per pixel."""
+    """The interval at which a render is saved, in seconds or in samples per pixel."""
 
     seconds: float = 0.0
     spp: int = 0
@@ -19,7 +19,7 @@ class Interval:
         """Reads text such as ``60s``, ``10m`` or ``100spp``.
 
         Raises:
-            ValueError: The text has another form.
+            ValueError: The text has the wrong form.
         """
         match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|spp)", text)
         if not match or float(match[1]) == 0 or (match[2] == "spp" and "." in match[1]):
@@ -30,13 +30,13 @@ class Interval:
 
 
 class LastKept:
-    """Remembers when a render was saved last.
+    """Remembers when a render was last saved.
 
     Parameters:
-        spp: The samples per pixel that it begins with.
+        spp: The samples per pixel with which it begins.
 
     Attributes:
-        begin: When it began, by ``time.perf_counter``.
+        begin: The time when it began, by ``time.perf_counter``.
     """
 
     def __init__(self, spp: int) -> None:
@@ -44,11 +44,11 @@ class LastKept:
         self.mark(spp)
 
     def mark(self, spp: int) -> None:
-        """Call it when the render, with ``spp`` samples per pixel, is saved."""
+        """Records that the render was saved with ``spp`` samples per pixel."""
         self._time, self._spp = time.perf_counter(), spp
 
     def is_due(self, every: Interval, spp: int) -> bool:
-        """Should the render be saved again?"""
+        """Whether the render should be saved again."""
         if every.spp:
             return spp - self._spp >= every.spp
         return time.perf_counter() - self._time >= every.seconds

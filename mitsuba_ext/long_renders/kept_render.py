@@ -25,12 +25,12 @@ from .state import Batch, BatchResult, RenderState
 
 
 class KeptRender:
-    """A render in batches that is saved in a folder, and continued from there.
+    """A render in batches that is saved in a folder and continued from it.
 
     Parameters:
         integrator: An integrator whose ``render()`` renders a batch, and which has the attribute
             ``is_cancelled``.
-        folder, every: The folder, and how often the render is saved.
+        folder, every: The folder, and the interval at which the render is saved.
         parameters: The integrator's parameters on which the image depends.
     """
 
@@ -53,13 +53,13 @@ class KeptRender:
         state of the render, and whether it was interrupted.
 
         Args:
-            spp: Samples per pixel of the whole image; 0 for the number of the sampler.
-            seconds: The time limit of this call; ``None`` for none.
-            progress: Called after each batch with the fraction done.
+            spp: Samples per pixel of the whole image; 0 for the sampler's number.
+            seconds: The time limit of this call, in seconds; ``None`` for none.
+            progress: A function that is called after each batch with the fraction done.
 
         Raises:
             InputError: The folder holds another render, or cannot be used.
-            KeyboardInterrupt: Ctrl-C, before the first batch was done.
+            KeyboardInterrupt: Ctrl-C was pressed before the first batch was done.
         """
         goal = Goal(sample_count(sensor, spp), seconds=seconds)
         batches = _Batches(self._integrator, scene, sensor, seed)
@@ -119,7 +119,7 @@ class KeptRender:
             mi.Log(mi.LogLevel.Warn, f"the render could not be kept: {problem}")
 
     def _description(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> dict[str, Any]:
-        """Everything that the image depends on, except the number of samples."""
+        """Everything on which the image depends, except the number of samples."""
         integrator, film = self._integrator, sensor.film()
         return {
             "scene hash": fingerprint(scene) + _digest_of_text(scene),
@@ -138,7 +138,7 @@ class _CancelledError(Exception):
 
 
 class _Batches(IntegratorBatches):
-    """Discards a batch that was cancelled, as it has fewer samples than it should."""
+    """Discards a cancelled batch, because it lacks samples."""
 
     def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
         result = super().render(batch, learned)
@@ -148,8 +148,8 @@ class _Batches(IntegratorBatches):
 
 
 def _digest_of_text(scene: mi.Scene) -> str:
-    """A hash of the ``str()`` of shapes and lights. It covers choices such as the distribution of a
-    microfacet BSDF, which are not among the parameters that the fingerprint covers."""
+    """A hash of the ``str()`` of shapes and lights. It covers settings that the fingerprint does
+    not cover, such as the distribution of a microfacet BSDF."""
     parts = [*scene.shapes(), *scene.emitters()]
     text = sorted(re.sub("0x[0-9a-f]+", "", str(part)) for part in parts)  # without addresses
     return hashlib.sha256("".join(text).encode()).hexdigest()

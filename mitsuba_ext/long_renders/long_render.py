@@ -1,4 +1,4 @@
-"""A render in batches, until a goal is reached."""
+"""A render in batches that ends when it reaches a goal."""
 
 from __future__ import annotations
 
@@ -15,30 +15,31 @@ from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
 
-#: The fewest batches from which the error of an image is estimated.
-_FEWEST = 8
+#: The minimum number of batches from which the error of an image is estimated.
+_MIN_BATCHES = 8
 
-#: More samples per pixel than a batch has.
-_ANY = 1 << 30
+#: A number of samples per pixel larger than in any batch.
+_LARGER_THAN_A_BATCH = 1 << 30
 
-#: Batches that measure the speed are shorter by this factor.
+#: The factor by which batches that measure the speed are shorter.
 _PROBE_DIVISOR = 16
 
-#: The error is computed again when the number of batches has grown by this factor: for large
+#: The factor by which the number of batches must grow before the error is computed again: for large
 #: images, the computation takes as long as some of their samples.
-_LATER = 1.05
+_ERROR_GROWTH = 1.05
 
 
 @dataclass(frozen=True)
 class Goal:
-    """When a render ends: as soon as one of these is reached.
+    """The goal of a render, which ends as soon as one of these limits is reached.
 
     Attributes:
         spp: Samples per pixel; ``None`` for no limit.
-        error: The relMSE of the image, as estimated from its batches; ``None`` for none.
-        seconds: The time of this call; ``None`` for no limit. The speed of the first batches
-            decides how many fit: a render that ended by the clock would prefer fast samples. In
-            this process, these batches are short, and learn nothing for others.
+        error: The relMSE of the image, estimated from its batches; ``None`` for no limit.
+        seconds: The time of this call, in seconds; ``None`` for no limit. The speed of the first
+            batches determines how many fit: a render that ended by the clock would be biased
+            towards fast samples. In this process, these batches are short and learn nothing for
+            others.
     """
 
     spp: int | None = None
@@ -47,16 +48,16 @@ class Goal:
 
 
 class LongRender:
-    """Adds batches to a state until a goal is reached. Batches are independent renders, which are
-    added in the order of their arrival: any process can render them.
+    """Adds batches to a state until a goal is reached. Batches are independent renders that any
+    process can render; they are added in the order of their arrival.
 
     Parameters:
-        renderer: Renders the batches.
-        state: The batches that have been rendered already.
-        progress: Called after each batch.
+        renderer: The renderer of the batches.
+        state: The batches rendered so far.
+        progress: A function that is called after each batch.
 
     Attributes:
-        state: The batches that have been rendered.
+        state: All finished batches.
         goal_spp: Samples per pixel of the finished render; 0 if unknown.
     """
 
@@ -69,7 +70,7 @@ class LongRender:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
         self._probes = self._teaches_late = False
-        # The number of batches after which the error was computed last, and that error
+        # The number of batches when the error was last computed, and that error
         self._error: tuple[int, float | None] = (0, None)
 
     def run(
@@ -79,14 +80,17 @@ class LongRender:
         executor: Executor | None = None,
         workers: int | Callable[[], int] = 1,
     ) -> bool:
-        """Renders. Returns True if the goal was reached.
+        """Renders batches. Returns True if the goal was reached.
 
         Args:
-            goal: When to end.
-            is_stopped: Called after each batch, and while workers render: returns True to end.
-            executor: Renders the batches of a ``BatchRenderer`` in other processes: see
-                :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`. ``None`` for this process.
-            workers: How many batches the executor renders at a time, or a function that returns it.
+            goal: The goal.
+            is_stopped: A function that is called after each batch and while workers render, and
+                returns True to end.
+            executor: The executor that renders the batches of a ``BatchRenderer`` in other
+                processes; see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`. ``None`` for
+                this process.
+            workers: The number of batches that the executor renders at a time, or a function that
+                returns it.
 
         Raises:
             InputError: A batch cannot be rendered.
@@ -100,9 +104,9 @@ class LongRender:
         else:
             dispatch = Dispatch(executor, self._renderer, count_workers)
             results = dispatch.results(self._batches(), lambda: self._learned, is_stopped)
-        # The speed is measured from the first result to the one with this number
+        # The speed is measured from the first result to the result with this number
         measured = 1 + QUEUE * count_workers()
-        # Batches that use what one of them has learned have another speed
+        # Batches that use the learned state have a different speed
         plans = (measured, measured + 2) if self._teaches_late else (measured,)
         begin, warm, count = time.perf_counter(), 0.0, 0
         while not self._is_reached():
@@ -112,7 +116,7 @@ class LongRender:
             self.state.add(result)
             count += 1
             if count in (1, measured + 1):
-                # Its time is not measured: its kernels may have been compiled, or it learned
+                # Its time is not measured because it may have compiled kernels or learned
                 warm, before = time.perf_counter(), self.state.spp
             elif goal.seconds is not None and count in plans:
                 seconds = (time.perf_counter() - warm) / (self.state.spp - before)
@@ -123,12 +127,12 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relMSE estimated from the batches (it may be a few batches old); ``None`` before
-        there are enough of them, and for a black image."""
+        """The relMSE estimated from the batches (possibly a few batches ago); ``None`` before there
+        are enough batches, and for a black image."""
         batches = self.state.images
-        if batches is None or batches.count < _FEWEST:
+        if batches is None or batches.count < _MIN_BATCHES:
             return None
-        if batches.count >= _LATER * self._error[0]:
+        if batches.count >= _ERROR_GROWTH * self._error[0]:
             both = (batches.mean, batches.variance)
             rgb = [image_files.to_rgb(each, batches.channels) for each in both]
             self._error = batches.count, announced_error(*rgb)
@@ -136,7 +140,7 @@ class LongRender:
 
     @property
     def spp_left(self) -> int | None:
-        """Samples per pixel that are still to be rendered; ``None`` if unknown. For an error to
+        """The samples per pixel still to be rendered; ``None`` if unknown. For an error to
         reach, the estimate assumes that relMSE falls with 1/n."""
         found = [self.goal_spp - self.state.spp] if self.goal_spp else []
         if self._goal.error and (error := self.error) is not None:
@@ -151,7 +155,7 @@ class LongRender:
         if (limit := self._goal.error) is None:
             return False
         error, is_endless = self.error, self._goal.spp is None and self._goal.seconds is None
-        if error is None and is_endless and len(self.state.done) >= _FEWEST:
+        if error is None and is_endless and len(self.state.done) >= _MIN_BATCHES:
             raise InputError(
                 f"the image is black, or not finite, after {self.state.spp} samples per pixel, and "
                 f"has no relative error that could be reached: limit the samples or the time too"
@@ -166,28 +170,28 @@ class LongRender:
 
     @property
     def _learned(self) -> bytes | None:
-        """The learned state that the next batch loads; ``None`` if that batch has to learn it."""
+        """The learned state that the next batch loads; ``None`` if the batch has to learn it."""
         if not self._renderer.learns or (self.state.learned is None and self._is_short):
             return b""
         return self.state.learned
 
     @property
     def _is_short(self) -> bool:
-        """Is the time of this call too short for a batch that learns for others, or unknown yet
-        whether it is?"""
-        longest = self._renderer.length(_ANY, teaches=True)
+        """Whether the time of this call is, or may be, too short for a batch that learns for
+        others."""
+        longest = self._renderer.length(_LARGER_THAN_A_BATCH, teaches=True)
         left = self.goal_spp - self.state.spp
         return self._probes or (self._teaches_late and left < 2 * longest)
 
     def _batches(self) -> Iterator[Batch]:
-        """The next batches: indices that are missing among the finished batches come first."""
+        """The next batches: indices missing among the finished batches come first."""
         seed, spp = self._renderer.seed, self.state.spp
         known = {batch.index for batch in self.state.done if batch.seed == seed}
         for index in itertools.count():
             if self.goal_spp and spp >= self.goal_spp:
                 return
             if index not in known:
-                left = self.goal_spp - spp if self.goal_spp else _ANY
+                left = self.goal_spp - spp if self.goal_spp else _LARGER_THAN_A_BATCH
                 length = self._renderer.length(left, teaches=self._learned is None)
                 if self._probes:
                     length = max(1, length // _PROBE_DIVISOR)

@@ -1,4 +1,4 @@
-"""The state of a render in batches: the sum of their images, and the list of the batches."""
+"""The state of a render in batches: the list of the batches, and the sum of their images."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Batch(NamedTuple):
 
     Attributes:
         seed: The seed of the render.
-        index: The number of the batch among those of this seed.
-        spp: Its samples per pixel.
+        index: The index of the batch among the batches of this seed.
+        spp: The samples per pixel of the batch.
     """
 
     seed: int
@@ -34,12 +34,12 @@ class BatchResult(NamedTuple):
 
     Attributes:
         batch: The batch.
-        contents, has_weights: See :class:`~mitsuba_ext.rendering.film_sums.FilmSums`.
+        contents, has_weights: The data of :class:`~mitsuba_ext.rendering.film_sums.FilmSums`.
         image: The developed film with its AOVs: [height, width, channel].
-        channels, image_channel_count: See :class:`~mitsuba_ext.rendering.batches.Batches`.
+        channels, image_channel_count: As in :class:`~mitsuba_ext.rendering.batches.Batches`.
         aov_names: Channels besides those of the image.
-        learned: The file ``save_learned`` of the integrator, for the other batches; empty if there
-            was nothing to learn, ``None`` if the batch was not asked to learn.
+        learned: The file that the integrator's ``save_learned`` writes, for the other batches;
+            empty if there was nothing to learn, ``None`` if the batch did not have to learn.
         totals: The cost of the batch.
     """
 
@@ -66,10 +66,10 @@ class RenderState:
     Attributes:
         done: The batches, in the order in which they were added.
         film: The sum of the contents of their films.
-        images: Mean and variance of their images; ``None`` before the first.
+        images: The mean and variance of their images; ``None`` before the first batch.
         aov_names: Channels besides those of the image.
-        learned: What one of them has learned for the others: see :class:`BatchResult`.
-        totals: Their total cost.
+        learned: The state that a batch learned for the others, as in :class:`BatchResult`.
+        totals: The total cost of the batches.
     """
 
     def __init__(self) -> None:
@@ -81,14 +81,14 @@ class RenderState:
 
     @property
     def spp(self) -> int:
-        """Samples per pixel of all batches."""
+        """The samples per pixel of all batches together."""
         return self.film.spp
 
     def add(self, result: BatchResult) -> None:
         """Adds a batch.
 
         Raises:
-            InputError: Its image has another size, or other channels, than those before.
+            InputError: The image's size or channels differ from the previous batches.
         """
         before = self.images
         if before and (before.mean.shape, before.channels) != (result.image.shape, result.channels):
@@ -112,7 +112,7 @@ class RenderState:
         """The merged state, with the batches of both.
 
         Raises:
-            InputError: Both contain the same batch, or their channels differ.
+            InputError: Both states contain the same batch, or their channels differ.
         """
         shared = {batch[:2] for batch in self.done} & {batch[:2] for batch in other.done}
         if shared:
@@ -133,11 +133,12 @@ class RenderState:
         return total
 
     def fill(self, film: mi.Film) -> None:
-        """Replaces the contents of a film by the image of all batches."""
+        """Replaces the contents of a film with the image of all batches."""
         self.film.fill(film, self.aov_names)
 
     def fits(self, film: mi.Film) -> bool:
-        """Do the images fit a film of this size, with these channels? If so, fills the film."""
+        """Whether the images fit a film with this size and these channels. If so, fills the
+        film."""
         if not self.done:
             return True
         if self.images.mean.shape[:2] != image_shape(film):
@@ -172,10 +173,10 @@ class RenderState:
         """The inverse of :meth:`arrays`.
 
         Args:
-            most_bytes: The most bytes of one of the arrays.
+            most_bytes: The maximum size of an array, in bytes.
 
         Raises:
-            DamagedError: They are no state.
+            DamagedError: The arrays are not a state.
         """
         state, anything = cls(), (-np.inf, np.inf)
         done = arrays.take("done", "u", (None, 3), 0, 0xFFFFFFFF, most_bytes)

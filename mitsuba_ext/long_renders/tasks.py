@@ -1,4 +1,4 @@
-"""The task of a worker: to render a batch. It keeps the scene for the next one."""
+"""The task of a worker: rendering a batch. The worker keeps the scene for the next batch."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Missing(NamedTuple):
     """The answer of a worker that lacks data for a batch.
 
     Attributes:
-        scene: Does it lack the scene's files, or have other versions of them?
-        learned: Does it lack the learned state?
+        scene: Whether it lacks the scene's files or has other versions of them.
+        learned: Whether it lacks the learned state.
     """
 
     scene: bool
@@ -31,7 +31,7 @@ class Missing(NamedTuple):
 
 
 def digest_of(learned: bytes | None) -> str | None:
-    """The digest by which a worker knows whether it has the learned state already; see
+    """The digest with which a worker checks whether it already has the learned state; see
     :func:`render_batch`."""
     if learned is None:
         return None
@@ -45,11 +45,11 @@ class _Kept(NamedTuple):
 
 _kept: _Kept | None = None
 
-#: The digest of the learned state that was received last, and that state.
+#: The digest of the last received learned state, and the state.
 _learned: tuple[str | None, bytes | None] = (None, None)
 
-#: Held while a batch is rendered: a worker of Dask has several threads, and Dr.Jit uses all cores
-#: for each batch.
+#: Held while a batch is rendered: a Dask worker has several threads, and Dr.Jit uses all cores for
+#: each batch.
 _rendering = threading.Lock()
 
 
@@ -61,12 +61,12 @@ def render_batch(
     bundle: Bundle | None = None,
 ) -> BatchResult | Missing:
     """Renders a batch in this process. The scene and the learned state are sent only to workers
-    that lack them: most have them from the batch before.
+    that lack them: most have them from the previous batch.
 
     Args:
-        request, batch: What to render.
+        request, batch: The render and its batch.
         digest: The digest of the learned state, from :func:`digest_of`. Empty if there was nothing
-            to learn, ``None`` if this batch is the one that learns.
+            to learn, ``None`` if this is the batch that learns.
         learned, bundle: The learned state and the scene, for a worker that lacks them.
 
     Returns:
@@ -82,7 +82,7 @@ def render_batch(
                 raise InputError("what was learned was damaged on its way to the worker")
             _learned = digest, learned
         if _kept is None or _kept.request != request:
-            _kept = None  # first, as Dr.Jit compiles the methods of all living objects
+            _kept = None  # first, because Dr.Jit compiles the methods of all living objects
             if renderer := _renderer(request, bundle):
                 _kept = _Kept(request, renderer)
         is_missing = Missing(_kept is None, bool(digest) and _learned[0] != digest)
@@ -100,7 +100,7 @@ def forget() -> None:
 
 
 def _renderer(request: RenderRequest, bundle: Bundle | None) -> BatchRenderer | None:
-    """Loads the scene of a request; ``None`` if the files at its paths are missing, or differ."""
+    """Loads the scene of a request; ``None`` if the files at its paths are missing or differ."""
     select_variant(request.variant, request.plugins)
     if request.threads:
         dr.set_thread_count(request.threads)
@@ -113,7 +113,7 @@ def _renderer(request: RenderRequest, bundle: Bundle | None) -> BatchRenderer | 
     if not request.description:
         return renderer
     found = json.loads(json.dumps(renderer.description(), default=str))
-    # The bundle's maker may have followed links, so that its hash covers files of other names
+    # The maker of the bundle may have followed links, so its hash covers files with other names
     free = ["scene files hash"] if bundle else []
     if wrong := difference(json.loads(request.description), found, free):
         if bundle is None:

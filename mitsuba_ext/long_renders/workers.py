@@ -1,4 +1,4 @@
-"""Processes of this machine that render batches."""
+"""Processes on this machine that render batches."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from ..rendering import interrupts
 
 _PR_SET_PDEATHSIG = 1
 
-#: Exit codes of processes that somebody, or the system, has killed.
-_FROM_OUTSIDE = [
+#: The exit codes of processes killed by a user or by the system.
+_KILL_CODES = [
     -getattr(signal, name) for name in ("SIGKILL", "SIGTERM") if hasattr(signal, name)
 ]
 
-#: Seconds to wait for the exit code of a process that has died.
-_PATIENCE = 5
+#: The maximum time to wait for the exit code of a dead process, in seconds.
+_TIMEOUT = 5
 
 
 def threads_of_each(count: int) -> int:
-    """Threads of each of ``count`` processes that share this machine."""
-    # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
+    """The number of threads of each of ``count`` processes that share this machine."""
+    # With one thread, Mitsuba 3.9.1 deadlocks when it reads an EXR file
     return max(2, (os.cpu_count() or 1) // count)
 
 
 class WorkerKilledError(RuntimeError):
-    """A signal from outside has ended the process of a task: of a user, of a batch system, or of
-    the system when memory ran out. (Faults of native code send other signals.)"""
+    """The process of a task was ended by a signal from a user, from a batch system, or from the
+    operating system when memory ran out. (Faults in native code send other signals.)"""
 
 
 class Workers(Executor):
@@ -44,7 +44,7 @@ class Workers(Executor):
     its own task fails. (In a single ``ProcessPoolExecutor``, all tasks would fail.)
 
     Parameters:
-        count: Number of processes.
+        count: The number of processes.
     """
 
     def __init__(self, count: int) -> None:
@@ -52,7 +52,7 @@ class Workers(Executor):
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
         self._processes: list[BaseProcess | None] = [None] * count
         self._is_given_up = False
-        # A process ends with the thread that started it, so these threads live as long as this
+        # A process ends with the thread that started it, so these threads must live as long as this
         # object
         self._threads = [
             threading.Thread(target=self._serve, args=(number,), daemon=True)
@@ -67,8 +67,8 @@ class Workers(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Ends the processes. With ``cancel_futures``, they are killed: their tasks are not needed
-        any more, and one of them may hang."""
+        """Ends the processes. With ``cancel_futures``, they are killed, because their tasks are no
+        longer needed and may hang."""
         if cancel_futures:
             self._is_given_up = True
             for pool in filter(None, self._pools):
@@ -100,10 +100,10 @@ class Workers(Executor):
             pool.shutdown()
 
     def _killed(self, number: int) -> WorkerKilledError | None:
-        """What happened to a process that died; ``None`` if nobody has killed it."""
+        """Says how a process was killed; ``None`` if it was not."""
         process = self._processes[number]
-        process.join(_PATIENCE)
-        if process.exitcode not in _FROM_OUTSIDE:
+        process.join(_TIMEOUT)
+        if process.exitcode not in _KILL_CODES:
             return None
         name = signal.Signals(-process.exitcode).name
         return WorkerKilledError(
@@ -116,7 +116,7 @@ class Workers(Executor):
                 return pool.submit(function, *arguments, **options)
             except BrokenProcessPool:
                 pool.shutdown(wait=False)
-        # A forked process would share the threads and kernels of this one
+        # A forked process would share the threads and kernels of this process
         context = multiprocessing.get_context("spawn")
         self._pools[number] = pool = ProcessPoolExecutor(1, context, _start, (os.getpid(),))
         future = pool.submit(function, *arguments, **options)
@@ -131,5 +131,5 @@ def _start(parent: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # the parent has ended meanwhile
+        if os.getppid() != parent:  # the parent has already ended
             os._exit(1)

@@ -135,7 +135,7 @@ def test_who_renders_does_not_matter(request_of):
             batch = arguments[1]
             self.tries[batch] = self.tries.get(batch, 0) + 1
             future = Future()
-            if batch.index % 3 == 1 and self.tries[batch] < dispatch._TRIES:
+            if batch.index % 3 == 1 and self.tries[batch] < dispatch._MAX_FAILURES:
                 future.set_exception(OSError("the worker has died"))
             else:
                 future.set_result(function(*arguments))

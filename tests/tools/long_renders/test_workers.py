@@ -228,7 +228,7 @@ def test_what_is_learned_is_sent_to_workers_that_lack_it(scenes):
 
 def test_a_late_batch_is_given_to_another_worker_and_counts_once(make_scene, monkeypatch):
     monkeypatch.setattr(dispatch, "_PERIOD", 0.05)
-    monkeypatch.setattr(dispatch, "_FIRST_LATE", 0.4)
+    monkeypatch.setattr(dispatch, "_MIN_LATE", 0.4)
     request = RenderRequest(str(make_scene()))
     here = rendered(request, 96)
 
