@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from mitsuba_ext.estimators.chains.chains import Counts
+from mitsuba_ext.estimators.chains.chains import MutationCounts
 from mitsuba_ext.estimators.chains.target import Contribution, ImageTarget
 from mitsuba_ext.transport.estimator import Sample
 
@@ -22,7 +22,7 @@ class Histogram:
     def __init__(self) -> None:
         self.visits, self.uniform = (dr.zeros(mi.Float, BINS**2) for _ in range(2))
         self.total = dr.zeros(mi.Float64, 1)
-        self.counts: list[Counts] = []
+        self.counts: list[MutationCounts] = []
 
     def _bin(self, found: Contribution) -> mi.UInt32:
         place = mi.Point2u(found.position * BINS)

@@ -1,4 +1,4 @@
-"""Independent samples from which chains start."""
+"""Independent samples at which chains start."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator
 from .small_steps import SmallSteps
 from .target import Found, ImageTarget
 
-#: Largest number of samples that are evaluated at a time, without and with light paths, whose
+#: The maximum number of samples evaluated at a time, without and with light paths, whose
 #: contributions are stored.
-_MOST_LANES = {False: 1 << 20, True: 1 << 18}
+_MAX_LANES = {False: 1 << 20, True: 1 << 18}
 
-#: Streams of random numbers, which differ from those of the chains.
+#: Streams of random numbers, different from the streams of the chains.
 _CAMERA, _LIGHT, _CHOICE = 0, 1, 2
 
 
@@ -33,12 +33,12 @@ class Bootstrap:
 
     Parameters:
         target: The target function.
-        seed: Seed of the random numbers.
-        count: Least number of samples.
-        take: Is called with the contributions of the samples, a part of the samples at a time.
+        seed: The seed of the random numbers.
+        count: The minimum number of samples.
+        take: A function that is called with the contributions of the samples, part by part.
 
     Attributes:
-        count: Number of samples: a square number.
+        count: The number of samples, a square number.
         mean: The mean of the target function.
         error: The standard error of ``mean``, divided by ``mean``, as if the samples were not
             stratified.
@@ -54,8 +54,8 @@ class Bootstrap:
         self._seed, self._has_light = seed, target.has_light_paths
         self._cells = math.isqrt(count - 1) + 1
         self.count = self._cells**2
-        # Parts of equal width: they share kernels
-        parts = -(-self.count // _MOST_LANES[target.has_light_paths])
+        # Parts of equal width, which share kernels
+        parts = -(-self.count // _MAX_LANES[target.has_light_paths])
         width, values = -(-self.count // parts), []
         for part in range(parts):
             index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, part * width)
@@ -69,13 +69,13 @@ class Bootstrap:
         self.mean = float(self._sums[-1]) / self.count
         deviation = float(np.std(values)) / math.sqrt(self.count)
         self.error = deviation / self.mean if self.mean > 0 else 0.0
-        # The last sample that is not black: rounding must not choose one behind it
+        # The last sample that is not black: rounding must not choose a later one
         self._last = int(np.searchsorted(self._sums, self._sums[-1]))
         self._offset = float(mi.sample_tea_float32(mi.UInt32(seed), _CHOICE)[0])
 
     def numbers(self, index: mi.UInt32, records: Sequence[StateNumbers] = ()) -> Numbers:
-        """The random numbers of these samples. ``records`` are given the numbers that are drawn:
-        one those of camera paths, the other those of light paths."""
+        """The random numbers of these samples. ``records`` receive the numbers drawn: the first for
+        camera paths, the second for light paths."""
         camera, light = records or [StateNumbers(SmallSteps())] * 2
         seed = stream(self._seed, _CAMERA)
         numbers = StratifiedNumbers.begin(generator(seed, index), index, self._cells, camera)
@@ -83,8 +83,8 @@ class Bootstrap:
             return numbers
         rng = generator(stream(self._seed, _LIGHT), index)
         # Not a literal: recorded kernels (transport/frozen.py) would keep the constant until the
-        # first mutation, and the first render of a scene would differ from the second one by
-        # rounding
+        # first mutation, and the first render of a scene would differ from the second by rounding
+        # errors
         known = dr.opaque(mi.UInt32, 0, dr.width(index))
         return BothEnds(
             numbers, ProposedNumbers(rng, dr.zeros(mi.UInt32, dr.width(index)), known, light)

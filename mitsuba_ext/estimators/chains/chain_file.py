@@ -12,18 +12,18 @@ import numpy as np
 from ...planning import learned_file
 from ...util.stored_arrays import StoredArrays
 
-#: The only part of these files.
+#: The only section of these files.
 _PART = "chains"
 
 
 class ChainFile:
-    """The file that a render continues from, and to which it saves its state.
+    """The file from which a render continues, and to which it saves its state.
 
     Parameters:
-        path: The file. It need not exist yet.
-        scene, sensor, seed: What is rendered.
-        parameters: The parameters of the integrator on which the image depends.
-        where: The name, in error messages, of the parameter that names the file.
+        path: The file, which need not exist yet.
+        scene, sensor, seed: The scene, the sensor and the seed of the render.
+        parameters: The integrator's parameters on which the image depends.
+        where: The name in error messages of the parameter that names the file.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class ChainFile:
         """The saved state; ``None`` if the file does not exist.
 
         Raises:
-            ValueError: The file is of another kind, damaged, or of another render.
+            ValueError: The file is of another kind, damaged, or belongs to another render.
         """
         if not self._path.exists():
             return None
@@ -55,7 +55,7 @@ class ChainFile:
 
 
 def _digest(sensor: mi.Sensor) -> str:
-    """A hash of the sensor's class, its motion, and the parameters that it exposes by name."""
+    """A hash of the sensor's class, its motion, and its named parameters."""
     values = mi.traverse(sensor)
     motion = getattr(sensor, "motion", "")
     text = "".join(f"{key}={values[key]}" for key in sorted(values.keys()))

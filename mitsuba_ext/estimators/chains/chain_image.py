@@ -1,4 +1,4 @@
-"""The image to which chains add their visits."""
+"""The image to which chains add visits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ChainImage:
     samples.
 
     Parameters:
-        film: The film; it must be prepared, and accept splats.
+        film: The film, which must be prepared and accept splats.
     """
 
     def __init__(self, film: mi.Film) -> None:
@@ -51,7 +51,7 @@ class ChainImage:
         block.put(found.position, [value.x, value.y, value.z, *others], weight > 0)
 
     def add_tensors(self, tensors: Sequence[mi.TensorXf]) -> None:
-        """Adds another image of this film, given as its :meth:`tensors`."""
+        """Adds another image of this film, given by its :meth:`tensors`."""
         for block, tensor in zip(self._blocks, tensors):
             block.put_block(mi.ImageBlock(tensor, offset=block.offset()))
         dr.eval(self.tensors())
@@ -60,7 +60,7 @@ class ChainImage:
         """Adds the tensors of an image of this film from a file.
 
         Raises:
-            DamagedError: They have another size.
+            DamagedError: The tensors have a different size.
         """
         shapes = [tensor.shape for tensor in self.tensors()]
         arrays = (
@@ -70,7 +70,7 @@ class ChainImage:
         self.add_tensors([mi.TensorXf(array) for array in arrays])
 
     def tensors(self) -> list[mi.TensorXf]:
-        """The pixels of each block. A launch evaluates them."""
+        """The pixels of each block. A kernel launch evaluates them."""
         return [block.tensor() for block in self._blocks]
 
     def _filtered(self, visits: mi.TensorXf) -> mi.TensorXf:

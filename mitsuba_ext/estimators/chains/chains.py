@@ -1,4 +1,4 @@
-"""The base class of all kinds of chains."""
+"""The base class of all chains."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from .small_steps import SmallSteps
 from .stored import Arrays, Ranges, arrays_of, value_of
 from .target import ImageTarget
 
-#: Random numbers of a state that a chain stores, for the camera's end of its path and for the
-#: light's: about 20 bounces. Numbers beyond these are drawn anew for each proposal, which is a
+#: The number of random numbers that a chain stores per state, for the camera's end of its path and
+#: for the light's: about 20 bounces. Further numbers are drawn anew for each proposal, which is a
 #: large step in these dimensions.
-MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
+MAX_NUMBERS, MAX_LIGHT_NUMBERS = 128, 96
 
-#: Approximate number of mutations of a launch, of all chains together (a second or two on two CPU
-#: cores), and least number for each chain. States are read and written, and the clock is checked,
-#: between launches.
-_LAUNCH, _LEAST_LAUNCH = 1 << 21, 16
+#: The approximate number of mutations of a launch, over all chains (a second or two on two CPU
+#: cores), and the minimum number per chain. Between launches, states are read and written, and the
+#: clock is checked.
+_LAUNCH, _MIN_LAUNCH = 1 << 21, 16
 
-#: The most chains that a file may have.
-_MOST_CHAINS = 1 << 20
+#: The maximum number of chains in a file.
+_MAX_CHAINS = 1 << 20
 
-#: Streams of random numbers, different from those of the bootstrap.
+#: Streams of random numbers, different from the streams of the bootstrap.
 CAMERA, LIGHT = 3, 4
 
 
 @dataclass
-class Counts:
+class MutationCounts:
     """Statistics of chains, in each lane.
 
     Attributes:
-        large, accepted_large, accepted_small: Number of large steps, and of accepted steps of each
-            kind.
+        large, accepted_large, accepted_small: The number of large steps, and of accepted steps of
+            each kind.
         large_target: The sum of the target function over all proposals of large steps.
-        scatter, shadow, connections: See :class:`~mitsuba_ext.transport.estimator.Sample`.
-        black: Number of proposals whose target function is 0.
-        longest: Largest number of visits of one state that were added to the image at once.
+        scatter, shadow, connections: As in :class:`~mitsuba_ext.transport.estimator.Sample`.
+        black: The number of proposals whose target function is 0.
+        longest: The largest number of visits of one state that were added to the image at once.
     """
 
     large: mi.UInt32
@@ -59,13 +59,13 @@ class Counts:
     longest: mi.Float
 
     @classmethod
-    def none(cls, lanes: int) -> Counts:
+    def none(cls, lanes: int) -> MutationCounts:
         kinds = [mi.UInt32] * 3 + [mi.Float] + [mi.UInt32] * 4 + [mi.Float]
         return cls(*(dr.zeros(kind, lanes) for kind in kinds))
 
-    def plus(self, is_large, is_accepted, target, sample, visits) -> Counts:
-        """The counts after one more proposal, from a state with ``visits`` visits so far."""
-        return Counts(
+    def plus(self, is_large, is_accepted, target, sample, visits) -> MutationCounts:
+        """The counts after another proposal, from a state with ``visits`` visits so far."""
+        return MutationCounts(
             self.large + dr.select(is_large, 1, 0),
             self.accepted_large + dr.select(is_large & is_accepted, 1, 0),
             self.accepted_small + dr.select(~is_large & is_accepted, 1, 0),
@@ -80,14 +80,14 @@ class Counts:
 
 @dataclass(frozen=True)
 class ChainRules:
-    """The parameters of the moves of chains.
+    """The parameters of the chains' moves.
 
     Attributes:
         large_step: The probability of a large step.
         steps: The small steps.
         uniform_weight: The weight of independent samples in the balance heuristic: their number per
-            mutation · approximate mean of the target function; 0 if they are not used. With a bound
-            of the luminance, it is the bound.
+            mutation, times the approximate mean of the target function; 0 if they are not used.
+            With a bound on the luminance, it is the bound.
     """
 
     large_step: float
@@ -96,8 +96,8 @@ class ChainRules:
 
 
 class Chains:
-    r"""Metropolis chains that sample vectors of numbers in proportion to a target function, one in
-    each lane.
+    r"""Metropolis chains that sample vectors of numbers in proportion to a target function, one
+    chain in each lane.
 
     Let :math:`a` be the probability of accepting a proposal. The expected visits are added to the
     image: :math:`a` for the proposal, and :math:`1 - a` for the state. Proposals of large steps are
@@ -113,16 +113,16 @@ class Chains:
         target: The target function.
         image: The image to which visits are added.
         rules: The parameters of the moves.
-        bootstrap, winners: Samples, and the index of the sample at which each chain starts.
-        seed: Seed of the random numbers.
-        energy: The factor of each visit's contribution.
+        bootstrap, winners: The samples, and the index of the sample at which each chain starts.
+        seed: The seed of the random numbers.
+        energy: A factor for each visit's contribution.
         stored: The result of :meth:`stored` of chains with the same parameters, from which these
             continue; ``bootstrap`` and ``winners`` are then not needed.
 
     Attributes:
         rules: The parameters of the moves.
-        count: Number of chains.
-        done: Number of mutations of each chain.
+        count: The number of chains.
+        done: The number of mutations of each chain.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Chains:
     ) -> None:
         self._target, self._image, self.rules = target, image, rules
         self._seed = seed
-        count = stored.number("count", "iu", 1, _MOST_CHAINS) if stored else len(winners)
+        count = stored.number("count", "iu", 1, _MAX_CHAINS) if stored else len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
         self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0
         self._uniform_weight = dr.opaque(mi.Float, rules.uniform_weight)
@@ -147,7 +147,7 @@ class Chains:
         lane = dr.arange(mi.UInt32, count)
         streams = [CAMERA, LIGHT] if target.has_light_paths else [CAMERA]
         self._rngs = [generator(stream(seed, number), lane) for number in streams]
-        # Not a literal: the first launch would need a kernel of its own
+        # Not a literal, with which the first launch would need a separate kernel
         self._weight = dr.opaque(mi.Float, 0, count)
         if not stored:
             self._begin(bootstrap, winners)
@@ -159,9 +159,9 @@ class Chains:
 
     @property
     def launch(self) -> int:
-        """Mutations of each chain in a launch. Time limit and Ctrl-C are checked between
-        launches."""
-        return max(_LEAST_LAUNCH, _LAUNCH // self.count)
+        """The number of mutations of each chain in a launch. The time limit and Ctrl-C are checked
+        between launches."""
+        return max(_MIN_LAUNCH, _LAUNCH // self.count)
 
     def stored(self) -> Arrays:
         """The state of the chains between two launches."""
@@ -170,19 +170,20 @@ class Chains:
         return {key: array for part in (own, *parts) for key, array in part.items()}
 
     def _state_kinds(self) -> dict[str, tuple[Any, int | None]]:
-        """The attributes that make up the state of all chains: the type of each, and its lanes."""
+        """The attributes that form the state of all chains, each with its type and its number of
+        lanes."""
         rngs = [mi.PCG32] * len(self._rngs)
         return {"_rngs": (rngs, self.count), "_weight": (mi.Float, self.count)}
 
     def _ranges(self) -> Ranges:
-        """The least and the largest value of each attribute, and of the fields of structures."""
+        """The minimum and the maximum value of each attribute, and of the fields of structures."""
         return {"target": (0, None), "_weight": (0, None)}
 
     def _check(self, stored: StoredArrays) -> None:
-        """Checks what was restored beyond the range of each number.
+        """Checks the restored state beyond the range of each number.
 
         Raises:
-            DamagedError: It is no state.
+            DamagedError: It is not a state.
         """
         for rng in self._rngs:
             stored.require(bool(dr.all(rng.inc & 1 == 1)), "an increment is even")
@@ -191,7 +192,7 @@ class Chains:
         """Makes these samples the states of the chains."""
         raise NotImplementedError
 
-    def advance(self, steps: int) -> Counts:
+    def advance(self, steps: int) -> MutationCounts:
         """Makes ``steps`` mutations of each chain."""
         raise NotImplementedError
 
@@ -213,6 +214,6 @@ class Chains:
 
 
 def acceptance(state: mi.Float, proposal: mi.Float) -> mi.Float:
-    """The probability of accepting a proposal, from the values of the target function. It is 1 if
-    the state has the value 0."""
+    """The probability of accepting a proposal, from the values of the target function; 1 if the
+    state has the value 0."""
     return dr.select(state > proposal, proposal / state, mi.Float(1))

@@ -10,25 +10,25 @@ import mitsuba as mi
 from ...rendering.camera import film_extent
 from .target import Found
 
-#: Approximate number of samples that estimate the luminance of a tile.
+#: The approximate number of samples that estimate the luminance of a tile.
 _SAMPLES = 64
 
-#: Darker tiles count as if they had this fraction of the mean luminance, which bounds the weights.
+#: The minimum luminance of a tile, as a fraction of the mean luminance, which bounds the weights.
 _FLOOR = 0.05
 
 
 class EvenTiles:
-    """Weights of the target function in inverse proportion to the luminance of the film's tiles,
+    """Weights of the target function, inversely proportional to the luminance of the film's tiles,
     which is estimated from samples. Dark parts of the image then get about as many visits as bright
-    ones. The expected image is the same with any weights.
+    ones. The expected image does not depend on the weights.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3 (two-stage
     MLT).
 
     Parameters:
-        film: The film whose crop window is divided into tiles.
-        samples: Number of samples of the whole film that :meth:`take` will be given. The chains
-            must start from other samples.
+        film: The film, whose crop window is divided into tiles.
+        samples: The number of samples of the whole film that :meth:`take` will receive. The chains
+            must start at other samples.
     """
 
     def __init__(self, film: mi.Film, samples: int) -> None:

@@ -1,43 +1,43 @@
-"""Chains in primary sample space, for an estimator that is one kernel."""
+"""Chains in primary sample space, for an estimator that is a single kernel."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from .chains import MOST_NUMBERS, Chains, Counts, acceptance
+from .chains import MAX_NUMBERS, Chains, MutationCounts, acceptance
 from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
 from .target import Contribution
 
 
 class LoopedChains(Chains):
-    """All mutations of a launch are one traced loop around the estimator. A sample of the estimator
-    must contribute to one film position only: there are no splats. See :class:`Chains`."""
+    """All mutations of a launch are one traced loop around the estimator, whose samples must each
+    contribute to only one film position (no splats). See :class:`Chains`."""
 
     def _begin(self, bootstrap, winners):
         record = RecordedNumbers(
-            dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self.rules.steps
+            dr.zeros(mi.Float, MAX_NUMBERS * self.count), self.count, self.rules.steps
         )
         numbers = bootstrap.numbers(winners, [record, record])
         self._state, _sample = self._target(numbers)
-        self._known = dr.minimum(numbers.index, MOST_NUMBERS)
+        self._known = dr.minimum(numbers.index, MAX_NUMBERS)
         self._values = record.written
         self._earlier = dr.opaque(mi.Float, 0, self.count)
-        # Evaluated now, so that the first launch has the same kernel as the others
+        # Evaluated now so that the first launch has the same kernel as the others
         dr.eval(self._state, self._known, self._values, self._rngs)
 
     def _state_kinds(self):
-        numbers, count = MOST_NUMBERS * self.count, self.count
+        numbers, count = MAX_NUMBERS * self.count, self.count
         own = {"_state": (Contribution, count), "_known": (mi.UInt32, count)}
         others = {"_values": (mi.Float, numbers), "_earlier": (mi.Float, count)}
         return {**super()._state_kinds(), **own, **others}
 
     def _ranges(self):
-        own = {"_known": (0, MOST_NUMBERS), "_values": (0, 1), "_earlier": (0, None)}
+        own = {"_known": (0, MAX_NUMBERS), "_values": (0, 1), "_earlier": (0, None)}
         return {**super()._ranges(), **own}
 
     def kernel_state(self) -> tuple:
-        """The objects and constants that kernels depend on, without the states."""
+        """The objects and constants on which kernels depend, without the states."""
         return (
             self._target, self._image, self.rules.steps, self.count, self._large_step,
             self._uses_uniform, self._uniform_weight, self._energy,
@@ -61,15 +61,15 @@ class LoopedChains(Chains):
         weight: mi.Float,
         earlier: mi.Float,
         values: mi.Float,
-    ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, Counts]:
-        """Makes ``steps`` mutations of each chain. It overwrites ``values``, the random numbers of
-        the states."""
+    ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, MutationCounts]:
+        """Makes ``steps`` mutations of each chain. Overwrites ``values``, the random numbers of the
+        states."""
         count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
         lane = dr.arange(mi.UInt32, self.count)
         rng, known = mi.PCG32(rng), mi.UInt32(known)
         weight, earlier = mi.Float(weight), mi.Float(earlier)
-        counts = Counts.none(self.count)
-        vector = dr.alloc_local(mi.Float, MOST_NUMBERS, value=dr.zeros(mi.Float))
+        counts = MutationCounts.none(self.count)
+        vector = dr.alloc_local(mi.Float, MAX_NUMBERS, value=dr.zeros(mi.Float))
         index = mi.UInt32(none)
         while index < known:
             vector[index] = dr.gather(mi.Float, values, index * count + lane)
@@ -92,7 +92,7 @@ class LoopedChains(Chains):
             is_accepted = threshold < a
             counts = counts.plus(is_large, is_accepted, proposal.target, sample, weight)
 
-            # ----- Add the state that is left, or the rejected proposal, to the image -----
+            # ----- Add the old state or the rejected proposal to the image -----
             left = dr.select(is_accepted, state, proposal)
             weight += 1 - a
             visits, earlier = self._added(state, proposal, is_accepted, weight, a, earlier)
@@ -103,9 +103,9 @@ class LoopedChains(Chains):
             weight = dr.select(is_accepted, a, weight)
             state = dr.select(is_accepted, proposal, state)
 
-            # ----- Store the numbers of the new state: draw them a second time -----
+            # ----- Store the numbers of the new state, by drawing them a second time -----
             again = ProposedNumbers(before, mi.UInt32(none), moved, numbers_now)
-            drawn = dr.minimum(numbers.index, MOST_NUMBERS)
+            drawn = dr.minimum(numbers.index, MAX_NUMBERS)
             index = dr.select(is_accepted, mi.UInt32(0), drawn)
             while index < drawn:
                 vector[index] = again.next_1d()
@@ -123,13 +123,13 @@ class LoopedChains(Chains):
         self, state: Contribution, proposal: Contribution, is_accepted: mi.Bool,
         weight: mi.Float, a: mi.Float, earlier: mi.Float,
     ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-        """The number of visits that are added to the image now: ``weight`` for a state that is
-        left, or ``a`` for a rejected proposal; and the new ``earlier``, in which subclasses count
+        """The number of visits to add to the image now (``weight`` for a state that the chain
+        leaves, ``a`` for a rejected proposal), and the new ``earlier``, in which subclasses count
         visits of earlier states."""
         return dr.select(is_accepted, weight, a), earlier
 
     def _last(self) -> mi.Float:
-        """The number of visits of the last state that are added."""
+        """The number of visits of the last state to add."""
         return self._weight
 
     def end(self):

@@ -1,4 +1,4 @@
-"""Filters that make the noise of chains more even, at the price of bias."""
+"""Filters that make the noise of chains more even, at the cost of bias."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .target import Contribution
 
 @dataclass(frozen=True)
 class NoiseFilters:
-    """The noise filters that are used.
+    """The noise filters in use.
 
     Source: D. Cline, PhD thesis, 2007, section 8.4.4.
 
     Attributes:
-        width: Width in pixels of the box that smooths the number of proposals; 0 for no such
+        width: The width in pixels of the box that smooths the number of proposals; 0 for no such
             filter.
-        most_consecutive: Largest number of consecutive visits of a chain to a pixel that are added;
-            0 for no limit.
+        most_consecutive: The maximum number of consecutive visits of a chain to a pixel that are
+            added; 0 for no limit.
     """
 
     width: int = 0
@@ -37,17 +37,17 @@ class NoiseFilters:
 
 class FilteredImage(ChainImage):
     """Multiplies the chains' contribution to a pixel by the expected number of proposals there, and
-    divides it by the number that were made. The expected number is the mean of the neighbourhood.
+    divides it by the actual number. The expected number is the mean over the neighbourhood.
 
     Parameters:
-        width: Width of the neighbourhood, in pixels.
+        width: The width of the neighbourhood, in pixels.
     """
 
     def __init__(self, film: mi.Film, width: int) -> None:
         super().__init__(film)
         self._film, self._width = film, width
         border = self._visits.border_size() > 0
-        # With the film's reconstruction filter, so that a proposal and a visit have the same weight
+        # Uses the film's reconstruction filter, so that a proposal and a visit have the same weight
         # in a pixel
         self._proposals = mi.ImageBlock(
             film.crop_size(), film.crop_offset(), 1, film.rfilter(), border, coalesce=False
@@ -55,7 +55,7 @@ class FilteredImage(ChainImage):
         self._blocks.append(self._proposals)
 
     def propose(self, found: Contribution) -> None:
-        """Counts proposals, black ones too."""
+        """Counts proposals, including black ones."""
         self._proposals.put(found.position, [mi.Float(1)])
 
     def _filtered(self, visits):
@@ -72,10 +72,10 @@ class FilteredImage(ChainImage):
 
 
 class FilteredChains(LoopedChains):
-    """Chains that count their proposals, and limit the consecutive visits to a pixel that they add.
+    """Chains that count their proposals and limit the consecutive visits to a pixel that they add.
 
     Parameters:
-        filters: The noise filters that are used.
+        filters: The noise filters in use.
     """
 
     def __init__(self, filters: NoiseFilters, *chains: Any) -> None:
@@ -89,7 +89,7 @@ class FilteredChains(LoopedChains):
         self._image.propose(proposal)
         visits = dr.select(is_accepted, weight, a)
         is_same = dr.all(dr.floor(state.position) == dr.floor(proposal.position))
-        # The visits of the state precede those of a rejected proposal, but are added later
+        # The visits of the state precede the visits of a rejected proposal, but are added later
         room = dr.maximum(self._most - earlier - dr.select(is_accepted, 0, weight), 0)
         added = dr.select(is_accepted | is_same, dr.minimum(visits, room), visits)
         remembered = dr.select(is_same, earlier + added, 0)

@@ -17,7 +17,7 @@ def stream(seed: int, number: int) -> int:
 
 
 def generator(seed: int, sequence: mi.UInt32) -> mi.PCG32:
-    """A random number generator in each lane, one for each ``sequence`` of this seed."""
+    """A random number generator in each lane, for the ``sequence`` with this seed."""
     # Hashed, as in Mitsuba's samplers: neighbouring sequences of PCG32 itself are correlated
     state, stream = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), sequence)
     # Without ``size``, which would add the lane index to the sequence
@@ -26,7 +26,7 @@ def generator(seed: int, sequence: mi.UInt32) -> mi.PCG32:
 
 class StateNumbers:
     """The random numbers of a chain's state; this base class stores none. It is not a dataclass,
-    since Dr.Jit would take one for a part of the state of the estimator's loops.
+    because Dr.Jit would treat one as part of the state of the estimator's loops.
 
     Parameters:
         steps: The small steps that move numbers.
@@ -40,7 +40,7 @@ class StateNumbers:
         return mi.Float(0)
 
     def write(self, index: mi.UInt32, value: mi.Float) -> None:
-        """Is called with each number that is drawn."""
+        """Receives each number drawn."""
 
 
 class LocalNumbers(StateNumbers):
@@ -55,11 +55,11 @@ class LocalNumbers(StateNumbers):
 
 
 class RecordedNumbers(StateNumbers):
-    """Random numbers in global memory. They are read from one array and written to another one.
+    """Random numbers in global memory, read from one array and written to another one.
 
     Parameters:
-        values: The numbers of all states: all first numbers, then all second ones, and so on.
-        lanes: Number of states.
+        values: The numbers of all states: all first numbers, then all second numbers, and so on.
+        lanes: The number of states.
     """
 
     def __init__(self, values: mi.Float, lanes: int, steps: SmallSteps) -> None:
@@ -67,7 +67,7 @@ class RecordedNumbers(StateNumbers):
         self._values, self._lanes = values, dr.opaque(mi.UInt32, lanes)
         self._count = dr.opaque(mi.UInt32, len(values) // lanes)
         self._lane = dr.arange(mi.UInt32, lanes)
-        #: The numbers that were written; 0 for all others.
+        #: The written numbers; 0 for all others.
         self.written = dr.zeros(mi.Float, len(values))
 
     def read(self, index):
@@ -85,10 +85,10 @@ class StratifiedNumbers:
 
     Attributes:
         rng: The random number generator.
-        index: How many numbers were drawn.
-        corner: Corner of the cell, in units of cells.
-        cells: Cells of the grid in each direction.
-        record: Is given the numbers that are drawn.
+        index: The number of numbers drawn so far.
+        corner: The corner of the cell, in units of cells.
+        cells: The number of cells of the grid in each direction.
+        record: Receives the numbers drawn.
     """
 
     rng: mi.PCG32
@@ -122,16 +122,16 @@ class StratifiedNumbers:
 
 @dataclass
 class ProposedNumbers:
-    """The random numbers of a proposal: those of the state, moved by small steps, and then new
-    ones.
+    """The random numbers of a proposal: the numbers of the state, moved by small steps, followed by
+    new ones.
 
     Numbers that the state's path did not draw have no influence on it. A proposal that needs more
-    numbers draws new ones: this has the density 1 in both directions.
+    numbers draws new ones, with density 1 in both directions.
 
     Attributes:
-        rng: The random number generator. It gives one number for each move or new number.
-        index: How many numbers were drawn.
-        known: How many of the state's numbers are moved; 0 in a large step.
+        rng: The random number generator, which provides one number for each move or new number.
+        index: The number of numbers drawn so far.
+        known: The number of the state's numbers that are moved; 0 in a large step.
         state: The state's numbers.
     """
 

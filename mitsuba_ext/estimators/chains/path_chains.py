@@ -8,13 +8,13 @@ import numpy as np
 
 from ...transport.frozen import frozen
 from ...transport.numbers import Numbers, copied
-from .chains import Chains, Counts
+from .chains import Chains, MutationCounts
 from .numbers import ProposedNumbers, StateNumbers, stream
 from .path_space.memory import Head, Logs, PathMemory, Place, stride
 from .path_space.mutations import NEW_PATH
-from .path_target import PathState
+from .path_target import ChainPath
 
-#: Streams of random numbers that all chains share: for the kinds of mutations, and for film
+#: Streams of random numbers shared by all chains: for the kinds of mutations, and for film
 #: positions.
 _KIND, _FILM = 6, 7
 
@@ -29,8 +29,8 @@ class PathChains(Chains):
         dr.eval(self._state, self._places, self._logs)
 
     @frozen
-    def _first(self, numbers: Numbers) -> tuple[PathState, Place, Logs]:
-        """The paths of the samples at which chains start, and their vertices."""
+    def _first(self, numbers: Numbers) -> tuple[ChainPath, Place, Logs]:
+        """The paths at which chains start, and their vertices."""
         memory, at = PathMemory.of(self._target.most), dr.zeros(mi.UInt32, self.count)
         memory, _numbers, proposal = self._target.mutations.new_path(
             memory, at, copied(numbers), mi.Bool(True)
@@ -39,7 +39,7 @@ class PathChains(Chains):
         return state, *self._stored(memory, state.head)
 
     def kernel_state(self) -> tuple:
-        """The objects and constants that kernels depend on, without the states."""
+        """The objects and constants on which kernels depend, without the states."""
         return (
             self._target, self._image, self.rules.large_step > 0, self.rules.steps, self.count,
             self._large_step, self._uses_uniform, self._uniform_weight, self._energy,
@@ -47,11 +47,11 @@ class PathChains(Chains):
 
     def _state_kinds(self):
         vertices = self.count * stride(self._target.most)
-        own = {"_state": (PathState, self.count), "_places": (Place, vertices)}
+        own = {"_state": (ChainPath, self.count), "_places": (Place, vertices)}
         return {**super()._state_kinds(), **own, "_logs": (Logs, vertices)}
 
     def _ranges(self):
-        # Kernels cope with any real numbers of vertices; the others choose places in memory
+        # Kernels accept any real numbers of vertices; the integers select places in memory
         most, anything = self._target.most, (-np.inf, np.inf)
         return {
             **super()._ranges(),
@@ -67,8 +67,8 @@ class PathChains(Chains):
         is_place = bool(dr.all((at == 0) | (at == stride(self._target.most))))
         stored.require(is_place, "a path begins elsewhere")
 
-    def _as_state(self, proposal) -> PathState:
-        return PathState(proposal.head, self._target.contribution(proposal), proposal.log_density)
+    def _as_state(self, proposal) -> ChainPath:
+        return ChainPath(proposal.head, self._target.contribution(proposal), proposal.log_density)
 
     def advance(self, steps):
         seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
@@ -88,16 +88,16 @@ class PathChains(Chains):
         done: mi.UInt32,
         seeds: list[mi.UInt32],
         rng: mi.PCG32,
-        state: PathState,
+        state: ChainPath,
         weight: mi.Float,
         places: Place,
         logs: Logs,
-    ) -> tuple[mi.PCG32, PathState, mi.Float, Place, Logs, Counts]:
-        """Makes ``steps`` mutations of each chain, which has made ``done`` mutations before."""
+    ) -> tuple[mi.PCG32, ChainPath, mi.Float, Place, Logs, MutationCounts]:
+        """Makes ``steps`` mutations of each chain, which has already made ``done`` mutations."""
         mutations = self._target.mutations
         none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
         rng, weight = mi.PCG32(rng), mi.Float(weight)
-        counts = Counts.none(self.count)
+        counts = MutationCounts.none(self.count)
         memory = self._loaded(state.head, places, logs)
         unused = StateNumbers(self.rules.steps)
         step = mi.UInt32(none)
@@ -115,7 +115,7 @@ class PathChains(Chains):
             new = self._as_state(proposal)
 
             # ----- Accept or reject -----
-            # Target functions are divided by the density as a new path, which is undone here
+            # Target functions are divided by the density as a new path, which is reversed here
             change = new.density - state.density + proposal.log_ratio
             ratio = new.found.target / state.found.target * dr.exp(change)
             ratio = dr.select(dr.isfinite(ratio), ratio, 0)
@@ -127,7 +127,7 @@ class PathChains(Chains):
                 is_large, is_accepted, new.found.target, self._target.sample(proposal), weight
             )
 
-            # ----- Add the state that is left, or the rejected proposal, to the image -----
+            # ----- Add the old state or the rejected proposal to the image -----
             left = dr.select(is_accepted, state.found, new.found)
             visits = dr.select(is_accepted, weight + (1 - a), a)
             self._image.add(left, visits * self._share(left.target))
@@ -135,7 +135,7 @@ class PathChains(Chains):
                 share = self._share(new.found.target)
                 self._image.add_uniform(new.found, dr.select(is_large, share, 0))
             weight = dr.select(is_accepted, a, weight + (1 - a))
-            # The vertices stay where they are: ``head.at`` tells which path is the state
+            # The vertices are not moved: ``head.at`` says which path is the state
             state = dr.select(is_accepted, new, state)
             step += 1
 

@@ -16,12 +16,13 @@ from .path_space.mutations import Mutations, Proposal
 from .small_steps import SmallSteps
 from .target import Contribution, Found, PlaceWeights, beyond_bound
 
-#: Rounds in which the techniques of new paths are learned, and paths of each round.
+#: The number of rounds in which the techniques of new paths are learned, and the number of paths
+#: per round.
 _ROUNDS, _PATHS = 3, 1 << 15
 
 
 @dataclass
-class PathState:
+class ChainPath:
     """The state of a chain of paths, without its vertices.
 
     Attributes:
@@ -41,16 +42,16 @@ class PathTarget:
     to the image is divided by its density.
 
     Parameters:
-        mutations: Makes the paths of the scene.
+        mutations: The mutations, which make the paths of the scene.
         weights: Weights of film positions; ``None`` if all have the same weight.
-        bound: The target function is the part of the luminance that is beyond this.
+        bound: A bound on the luminance; the target function is the part beyond it.
     """
 
     mutations: Mutations
     weights: PlaceWeights | None = None
     bound: float = 0.0
 
-    #: Paths draw their numbers from one stream, and each contributes to one film position.
+    #: Paths draw their numbers from a single stream, and each contributes to one film position.
     has_light_paths = False
 
     @property
@@ -63,12 +64,11 @@ class PathTarget:
 
     @property
     def most(self) -> int:
-        """Largest number of vertices of a path."""
+        """The maximum number of vertices of a path."""
         return self.mutations.space.most
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
-        """The contributions of new paths. It evaluates them, and the state that ``numbers`` have
-        reached."""
+        """The contributions of new paths. Evaluates them and the state of ``numbers``."""
         brought, target, sample, place = self._evaluated(numbers, mi.Bool(active))
         go_to(numbers, place)
         lane = dr.arange(mi.UInt32, dr.width(target))
@@ -79,8 +79,8 @@ class PathTarget:
     def _evaluated(
         self, numbers: Numbers, active: mi.Bool
     ) -> tuple[Contribution, mi.Float, Sample, Numbers]:
-        """The contribution of a new path, with its luminance; the target function; the state that
-        the numbers have reached."""
+        """The contribution of a new path, with its luminance; the target function; the state of the
+        numbers."""
         proposal, numbers = self._new_path(copied(numbers), active)
         brought = self._brought(proposal)
         target = beyond_bound(brought.target, self.bound)
@@ -99,7 +99,7 @@ class PathTarget:
 
     @frozen
     def _tried(self, numbers: Numbers) -> tuple[mi.UInt32, mi.Float]:
-        """Technique and target function of new paths."""
+        """The technique and the target function of new paths."""
         proposal, _numbers = self._new_path(copied(numbers), mi.Bool(True))
         return proposal.technique, self.contribution(proposal).target
 
@@ -115,13 +115,14 @@ class PathTarget:
         return brought
 
     def _brought(self, proposal: Proposal) -> Contribution:
-        """As :meth:`contribution`, but with the luminance instead of its part beyond the bound."""
+        """Like :meth:`contribution`, but with the luminance instead of its part beyond the
+        bound."""
         found = proposal.found
         factor = dr.exp(found.log_geometry - proposal.log_density)
         value = dr.select(found.active, found.value * factor, 0)
         is_sound = dr.all(dr.isfinite(value))
         value = dr.select(is_sound, value, 0)
-        # The absolute values, since components can be negative in spectral variants
+        # The absolute values, because components can be negative in spectral variants
         target = mi.luminance(dr.abs(value))
         if self.weights is not None:
             target *= self.weights.at(found.position)

@@ -23,21 +23,22 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found
 
-#: Largest number of samples of a batch, without and with a time limit. Each batch starts its own
+#: The maximum number of samples of a batch, without and with a time limit. Each batch starts new
 #: chains, and few chains do not keep the processor busy.
 _BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
 
-#: The totals over all batches that are saved, besides the image.
-_SUMS = ("samples", "batches", "redistributed", "energy")
+#: The saved totals over all batches, besides the image.
+_TOTALS = ("samples", "batches", "redistributed", "energy")
 
-#: Largest number of chains of a batch.
-_MOST_CHAINS = 1 << 17
+#: The maximum number of chains of a batch.
+_MAX_CHAINS = 1 << 17
 
-#: The most samples, and batches, of a file.
-_MOST = {"samples": 1 << 62, "batches": 1 << 31}
+#: The maximum numbers of samples and batches in a file.
+_MAX_STORED = {"samples": 1 << 62, "batches": 1 << 31}
 
-#: Index of the random number stream of the first batch; the next batches use the following ones.
-_BATCHES = 16
+#: The index of the random number stream of the first batch; later batches use the following
+#: streams.
+_FIRST_STREAM = 16
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,16 @@ class RedistributionSettings:
     """The parameters of a render by energy redistribution.
 
     Attributes:
-        chain_length: Mutations of a chain.
-        mutations: Mutations per pixel if all energy is redistributed; 0 for as many as samples.
-        outliers: Chains redistribute the part of a sample's energy that is beyond this many times
-            the brightness of its neighbourhood. 0 redistributes all energy.
-        luminance_samples: Samples that measure brightness first.
+        chain_length: The number of mutations of a chain.
+        mutations: The number of mutations per pixel if all energy is redistributed; 0 for the
+            number of samples.
+        outliers: The multiple of the neighbourhood's brightness beyond which chains redistribute a
+            sample's energy. 0 redistributes all energy.
+        luminance_samples: The number of samples that first measure the brightness.
         steps: The small steps of chains in primary sample space.
         filters: The noise filters.
-        file: If it holds a state, the render continues from it. The last state is saved to it.
+        file: The file to which the last state is saved. If it holds a state, the render continues
+            from it.
     """
 
     chain_length: int
@@ -65,14 +68,14 @@ class RedistributionSettings:
 
 
 class RedistributionRender(ChainRender):
-    """Takes independent samples, and redistributes the part of their energy that is beyond a bound:
-    chains of a fixed length start at these samples, and deposit an equal share of energy at each
-    state. ``spp`` are samples per pixel.
+    """Takes independent samples, and redistributes the part of their energy beyond a bound: chains
+    of a fixed length start at these samples, and deposit equal amounts of energy at each state.
+    ``spp`` is the number of samples per pixel.
 
     Samples are chosen by systematic sampling: their energies are added up, and a chain starts at a
     sample for each multiple of a common energy, shifted by a random offset, that lies between the
-    sums before and after it. The expected number of chains is proportional to the energy, so that
-    no energy is lost on average.
+    sums before and after the sample. The expected number of chains is proportional to the energy,
+    so no energy is lost on average.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8 (equal deposition flow, section 8.3.2); B.
     Bitterli, W. Jarosz, *Selectively Metropolised Monte Carlo Light Transport Simulation*, ACM
@@ -103,7 +106,7 @@ class RedistributionRender(ChainRender):
             target.bound = bound = settings.outliers * first.mean
         image = self._image()
         rules = ChainRules(0.0, settings.steps, bound)
-        # Energy of a deposit, in units of the target function of a sample
+        # The energy of a deposit, in units of a sample's target function
         deposit = self._spp * first.mean / (settings.mutations or self._spp)
         stored = settings.file.load() if settings.file else None
         if stored:
@@ -125,20 +128,21 @@ class RedistributionRender(ChainRender):
                 self._report(round(self._samples / self._pixel_count))
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
-        # Not after an error: a batch may be half done
+        # Not after an error, when a batch may be half done
         if settings.file:
             settings.file.save(self._stored(image))
 
     def _stored(self, image: ChainImage) -> Arrays:
-        """The sums over completed batches. They suffice, since the next batch takes new samples."""
+        """The sums over completed batches, which suffice because the next batch takes new
+        samples."""
         tensors = {f"image{n}": np.array(tensor) for n, tensor in enumerate(image.tensors())}
-        return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _SUMS}}
+        return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _TOTALS}}
 
     def _restore(self, stored: StoredArrays, image: ChainImage) -> None:
         image.restore(stored, [f"image{n}" for n in range(len(image.tensors()))])
-        for key in _SUMS:
+        for key in _TOTALS:
             is_count = isinstance(getattr(self, f"_{key}"), int)
-            least, most = (1, _MOST[key]) if is_count else (0, np.finfo(float).max)
+            least, most = (1, _MAX_STORED[key]) if is_count else (0, np.finfo(float).max)
             number = stored.number(key, "iu" if is_count else "f", least, most)
             setattr(self, f"_{key}", number)
 
@@ -151,13 +155,13 @@ class RedistributionRender(ChainRender):
         return FilteredChains(filters, *chains) if filters else self._kind(*chains)
 
     def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
-        """Adds a batch to the image: all of it, or nothing if there is an exception."""
+        """Adds a whole batch to the image, or nothing if there is an exception."""
         settings, target = self._settings, self._target
         part, energies = self._image(), []
-        seed = stream(self._seed, _BATCHES + self._batches)
+        seed = stream(self._seed, _FIRST_STREAM + self._batches)
 
         def take(found: Found) -> None:
-            """Adds the energy that is within the bound to the image."""
+            """Adds the energy within the bound to the image."""
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
                 kept = dr.rcp(1 + found.target / dr.opaque(mi.Float, target.bound))
@@ -167,10 +171,10 @@ class RedistributionRender(ChainRender):
         samples = Bootstrap(target, seed, size, take)
         self._statistics.rays["camera"] += samples.count
         energy = samples.mean * samples.count
-        # Very bright samples do not start more chains than if all energy were redistributed: each
-        # chain carries more energy instead
+        # Very bright samples start no more chains than if all energy were redistributed; each chain
+        # carries more energy instead
         wanted = samples.count * settings.mutations / self._spp or samples.count
-        most = min(_MOST_CHAINS, max(1.0, wanted / settings.chain_length))
+        most = min(_MAX_CHAINS, max(1.0, wanted / settings.chain_length))
         spacing = max(deposit * settings.chain_length, energy / most)
         winners = samples.choose_by_energy(spacing)
         if len(winners) > 0:

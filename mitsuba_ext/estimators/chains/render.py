@@ -1,4 +1,4 @@
-"""The common base of renders with chains."""
+"""The base class of renders with chains."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ...rendering.render import kernel_cache_misses
 from ...rendering.statistics import RenderStatistics
 from ...rendering.time_budget import TimeBudget
 from ...rendering.turns import let_others, tell
-from .chains import Chains, Counts
+from .chains import Chains, MutationCounts
 from .looped import LoopedChains
 from .path_chains import PathChains
 from .path_target import PathTarget
 from .stepped import SteppedChains
 from .target import ImageTarget
 
-#: The stream of random numbers of a first stage, different from those of the bootstrap and the
-#: chains.
+#: The stream of random numbers of a first stage, different from the streams of the bootstrap and
+#: the chains.
 FIRST_STAGE = 5
 
 
 class Stoppable(Protocol):
-    """The attributes of the integrator that a render reads."""
+    """The integrator attributes that a render reads."""
 
     timeout: float
     is_cancelled: bool
@@ -36,17 +36,18 @@ class Stoppable(Protocol):
 
 
 class ChainRender:
-    """One render. The film must already hold camera samples; the light of the chains is added to
-    them.
+    """A single render. The film must already hold camera samples, to which the light of the chains
+    is added.
 
     Parameters:
-        integrator: Has the time limit, and tells if the render was cancelled.
+        integrator: The integrator, which has the time limit and says whether the render was
+            cancelled.
         target: The target function of the chains.
-        seed: Seed of the random numbers.
-        spp: Samples, or mutations, per pixel.
-        camera_spp: Camera samples per pixel that the film holds.
-        statistics: Statistics of the render so far; they are updated.
-        start: Start of the render, by ``time.perf_counter``.
+        seed: The seed of the random numbers.
+        spp: The number of samples, or mutations, per pixel.
+        camera_spp: The number of camera samples per pixel in the film.
+        statistics: The statistics of the render so far, which are updated.
+        start: The start time of the render, by ``time.perf_counter``.
     """
 
     def __init__(
@@ -65,11 +66,11 @@ class ChainRender:
         self._film = target.sensor.film()
         width, height = film_extent(self._film)
         self._pixel_count = width * height
-        self._counts = {name: 0.0 for name in Counts.__dataclass_fields__}
+        self._counts = {name: 0.0 for name in MutationCounts.__dataclass_fields__}
         self._mutations = 0
 
     def run(self, interrupt: threading.Event) -> None:
-        """Renders, and adds the image to the film, even if an exception ends the render."""
+        """Renders, and adds the image to the film even if an exception ends the render."""
         raise NotImplementedError
 
     @property
@@ -81,14 +82,15 @@ class ChainRender:
     def _repeat(
         self, count: int, width: int, interrupt: threading.Event, act: Callable[[int], int]
     ) -> bool:
-        """Calls ``act`` until ``count`` steps are made, or as many as the time limit allows.
+        """Calls ``act`` until ``count`` steps, or as many as the time limit allows, have been made.
 
         Parameters:
-            width: Lanes of a step.
-            act: Is given the largest number of steps to make; returns the number that it made.
+            width: The number of lanes of a step.
+            act: A function that takes the maximum number of steps to make and returns the number
+                that it made.
 
         Returns:
-            False if the render was interrupted or cancelled before.
+            False if the render was interrupted or cancelled before the end.
         """
         integrator, done = self._integrator, 0
         budget = TimeBudget(integrator.timeout, self._start, width, 0).stage(count, 0, True)
@@ -107,7 +109,7 @@ class ChainRender:
                 tell(integrator.progress, min(1.0, done / budget.samples))
         return True
 
-    def _count(self, counts: Counts, mutations: int) -> None:
+    def _count(self, counts: MutationCounts, mutations: int) -> None:
         longest = float(dr.max(counts.longest)[0])
         self._counts["longest"] = max(self._counts["longest"], longest)
         for name in self._counts:

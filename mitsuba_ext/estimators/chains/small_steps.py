@@ -35,5 +35,5 @@ class SmallSteps:
         sample = 2 * sample - dr.select(is_up, 0, 1)
         distance = self.high * dr.exp(-math.log(self.high / self.low) * sample)
         moved = value + dr.select(is_up, distance, -distance)
-        # Rounding may give 1
+        # Rounding may yield 1
         return dr.minimum(moved - dr.floor(moved), _BELOW_ONE)

@@ -9,19 +9,19 @@ import mitsuba as mi
 
 from ...transport.numbers import BothEnds, Numbers
 from ...util.arrays import joined
-from .chains import MOST_LIGHT_NUMBERS, MOST_NUMBERS, Chains, Counts, acceptance
+from .chains import MAX_LIGHT_NUMBERS, MAX_NUMBERS, Chains, MutationCounts, acceptance
 from .numbers import ProposedNumbers, RecordedNumbers
 from .target import Contribution
 
 
 class SteppedChains(Chains):
-    """Each mutation is a call of the estimator, which may be several kernels, and may contribute to
-    any number of film positions. See :class:`Chains`."""
+    """Each mutation is a call of the estimator, which may consist of several kernels and contribute
+    to any number of film positions. See :class:`Chains`."""
 
     launch = 1
 
-    #: Random numbers that are stored, for each end of a path.
-    _most = (MOST_NUMBERS, MOST_LIGHT_NUMBERS)
+    #: The maximum number of random numbers stored for each end of a path.
+    _most = (MAX_NUMBERS, MAX_LIGHT_NUMBERS)
 
     def _begin(self, bootstrap, winners):
         empty = [dr.opaque(mi.Float, 0, most * self.count) for most in self._most]
@@ -59,13 +59,13 @@ class SteppedChains(Chains):
         stored.require(lanes == parts > 0, f"{parts} contributions, and {lanes} lanes")
 
     def advance(self, steps):
-        counts = Counts.none(self.count)
+        counts = MutationCounts.none(self.count)
         for _ in range(steps):
             counts = self._mutate(counts)
         self.done += steps
         return counts
 
-    def _mutate(self, counts: Counts) -> Counts:
+    def _mutate(self, counts: MutationCounts) -> MutationCounts:
         # ----- Propose -----
         camera_rng = self._rngs[0]
         is_large = camera_rng.next_float32() < self._large_step
@@ -76,8 +76,8 @@ class SteppedChains(Chains):
             ProposedNumbers(rng, mi.UInt32(none), dr.select(is_large, 0, known), record)
             for rng, known, record in zip(self._rngs, self._known, records)
         ]
-        # Evaluated now: they are used again after the estimator, whose kernels would compute them a
-        # second time
+        # Evaluated now because they are used again after the estimator, whose kernels would compute
+        # them a second time
         dr.eval(is_large, threshold, ends)
         found = self._target.evaluate(BothEnds(*ends) if len(ends) == 2 else ends[0])
         self._rngs = [end.rng for end in ends]
@@ -87,7 +87,7 @@ class SteppedChains(Chains):
         is_accepted = threshold < a
         counts = counts.plus(is_large, is_accepted, found.target, found.sample, self._weight)
 
-        # ----- Add the state that is left, or the rejected proposal, to the image -----
+        # ----- Add the old state or the rejected proposal to the image -----
         visits = self._weight + (1 - a)
         left = dr.select(is_accepted, visits * self._share(self._state), 0)
         rejected = dr.select(is_accepted, 0, a * self._share(found.target))
@@ -113,7 +113,7 @@ class SteppedChains(Chains):
         return counts
 
     def _remember(self, written: list[mi.Float], is_accepted: mi.Bool) -> None:
-        """Copies the numbers of accepted proposals to the states. It works in place, since the
+        """Copies the numbers of accepted proposals to the states. Works in place because the
         numbers of all states take hundreds of megabytes."""
         dr.eval(written)
         accepted = dr.compress(is_accepted)
@@ -151,7 +151,7 @@ def _ends(numbers: Numbers) -> list[Any]:
 def _wanted(
     parts: list[Contribution], lanes: list[mi.UInt32], wanted: list[mi.Bool]
 ) -> tuple[Contribution, mi.UInt32]:
-    """The contributions of lanes for which ``wanted`` is set, in one array, and their lanes."""
+    """The contributions of lanes with ``wanted`` set, in one array, and these lanes."""
     kept = []
     for part, lane, want in zip(parts, lanes, wanted):
         index = dr.compress((part.target > 0) & dr.gather(mi.Bool, want, lane))

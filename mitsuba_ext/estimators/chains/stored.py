@@ -13,16 +13,16 @@ import numpy as np
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .path_space.memory import Head, Logs, Place
-from .path_target import PathState
+from .path_target import ChainPath
 from .target import Contribution
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
 
-#: The most numbers of an array whose length the reader does not know.
-_MOST_NUMBERS = 1 << 27
+#: The maximum number of elements of an array whose length the reader does not know.
+_MAX_NUMBERS = 1 << 27
 
-#: The least and the largest value of an array or a field, by its name.
+#: The minimum and the maximum value of an array or a field, by its name.
 Ranges = Mapping[str, tuple[Any, Any]]
 
 
@@ -30,14 +30,14 @@ class StateFile(Protocol):
     """A file that holds the state of a render."""
 
     def load(self) -> StoredArrays | None:
-        """The saved state; ``None`` if none was saved yet."""
+        """The saved state; ``None`` if none has been saved yet."""
 
     def save(self, arrays: Arrays) -> None:
-        """Saves a state, which replaces the one before."""
+        """Saves a state, which replaces the previous one."""
 
 
 def arrays_of(value: Any, name: str) -> Arrays:
-    """The arrays of which ``value`` consists. It may be a Dr.Jit array, a random number generator,
+    """The arrays that make up ``value``, which may be a Dr.Jit array, a random number generator,
     one of the structures of :func:`_kinds`, or a list of these."""
     kinds = {made: kind for kind, made in _kinds().items()}
     if isinstance(value, list):
@@ -59,11 +59,11 @@ def value_of(
 
     Parameters:
         stored: The arrays of the file.
-        name: The name that was given to :func:`arrays_of`.
-        kind: What it was: a type, or a list of these.
-        width: The number of lanes; ``None`` for any, which all parts of a structure have.
-        ranges: The least and the largest value of arrays, and of the fields of structures, by
-            their names. Other real numbers are finite.
+        name: The name passed to :func:`arrays_of`.
+        kind: The type of the value, or a list of types.
+        width: The number of lanes; ``None`` for any number that all parts of a structure share.
+        ranges: The minimum and the maximum value of arrays and of the fields of structures, by
+            name. Other real numbers must be finite.
 
     Raises:
         DamagedError: The file has no such value.
@@ -93,9 +93,9 @@ def _field(name: str) -> str:
 
 
 def _kinds() -> dict[str, type]:
-    """The names of structures in files."""
+    """The structures in files, by name."""
     return {
-        "rng": mi.PCG32, "found": Contribution, "path": PathState, "head": Head, "place": Place,
+        "rng": mi.PCG32, "found": Contribution, "path": ChainPath, "head": Head, "place": Place,
         "logs": Logs,
     }  # fmt: skip
 
@@ -106,6 +106,6 @@ def _array(
 ) -> Any:  # fmt: skip
     letter = {dr.VarType.Float32: "f", dr.VarType.Float64: "f"}.get(dr.type_v(kind), "u")
     size = () if dr.depth_v(kind) == 1 else (dr.size_v(kind),)
-    longest = _MOST_NUMBERS if width is None else width * math.prod(size)
+    longest = _MAX_NUMBERS if width is None else width * math.prod(size)
     array = stored.take(name, letter, (*size, width), least, most, longest)
     return kind(array) if size else from_numpy(kind, array)

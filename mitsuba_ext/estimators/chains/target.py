@@ -21,7 +21,7 @@ class Contribution:
     """The contribution of a vector of random numbers to the image at one position.
 
     Attributes:
-        position: Position on the film.
+        position: The position on the film.
         value: The contribution as a colour, as if the film were one pixel.
         target: The luminance of ``value`` (of the absolute values of its components, which can be
             negative in spectral variants), times the weight of the film position.
@@ -37,10 +37,10 @@ class Found:
     """All contributions of vectors of random numbers, one vector in each lane.
 
     Attributes:
-        target: The target function: the sum of the ``target`` of all contributions of a lane; the
-            part of it beyond the bound if :class:`ImageTarget` has one.
+        target: The target function: the sum of the ``target`` of all contributions of a lane, or
+            its part beyond the bound if :class:`ImageTarget` has one.
         parts: The contributions, in arrays of any width.
-        lanes: For each of the parts, the lanes to which its contributions belong.
+        lanes: For each part, the lanes to which its contributions belong.
         sample: The sample of the estimator.
     """
 
@@ -54,21 +54,22 @@ class PlaceWeights(Protocol):
     """Weights of film positions in the target function."""
 
     def at(self, position: mi.Point2f) -> mi.Float:
-        """The weight of a film position: larger than zero."""
+        """The weight of a film position, larger than zero."""
 
 
 @dataclass
 class ImageTarget:
     """The target function of an estimator. The first random numbers make a camera ray, anywhere on
-    the film; the others an estimate of its radiance.
+    the film; the others make an estimate of its radiance.
 
     Parameters:
-        scene, sensor: The scene and the sensor that are rendered.
-        estimator: Estimates the radiance. The sample in a lane must not depend on other lanes.
+        scene, sensor: The rendered scene and the sensor.
+        estimator: The estimator of the radiance. The sample in a lane must not depend on other
+            lanes.
         spp: Samples per pixel of the whole render, for ray differentials.
-        has_light_paths: Does the estimator trace light paths, which draw from separate numbers?
+        has_light_paths: Whether the estimator traces light paths, which draw separate numbers.
         weights: Weights of film positions; ``None`` if all have the same weight.
-        bound: The target function is the part of the sum of luminances that is beyond this.
+        bound: A bound on the sum of luminances; the target function is the part beyond it.
     """
 
     scene: mi.Scene
@@ -86,7 +87,7 @@ class ImageTarget:
         return camera, sample
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
-        """All contributions. It evaluates them, and the state that ``numbers`` have reached."""
+        """All contributions. Evaluates them and the state of ``numbers``."""
         camera, sample = self._found(numbers, mi.Bool(active))
         lane = dr.arange(mi.UInt32, dr.width(camera.target))
         parts, lanes = [camera], [lane]
@@ -126,7 +127,8 @@ class ImageTarget:
         """Does nothing: only the target function of paths learns."""
 
     def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
-        """A contribution. Values that are not finite become black, so that no chain stays there."""
+        """A contribution. Values that are not finite become black, so that no chain gets stuck
+        there."""
         target = mi.luminance(dr.abs(value))
         is_sound = dr.isfinite(target)
         if self.weights is not None:
@@ -148,7 +150,7 @@ class ImageTarget:
 
 
 def beyond_bound(luminance: mi.Float, bound: float) -> mi.Float:
-    """The part of a luminance that is beyond a bound; all of it if the bound is 0."""
+    """The part of a luminance beyond a bound; all of it if the bound is 0."""
     if bound == 0:
         return luminance
     return dr.maximum(luminance - dr.opaque(mi.Float, bound), 0)

@@ -22,28 +22,28 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
-#: For estimators without and with light paths: the least and the largest number of chains, and the
-#: approximate number of mutations of a chain within these bounds. Longer chains forget the bright
-#: samples that they start from. With light paths, each mutation needs several kernels, which take
-#: as long to trace as 65536 mutations to run.
+#: For estimators without and with light paths: the minimum and the maximum number of chains, and
+#: the approximate number of mutations of a chain within these bounds. Longer chains depend less on
+#: the bright samples at which they start. With light paths, each mutation needs several kernels,
+#: and tracing them takes as long as running 65536 mutations.
 _CHAINS, _LENGTH = {False: (1 << 10, 1 << 16), True: (1 << 16, 1 << 18)}, {False: 1024, True: 64}
 
-#: Number of bootstrap samples: as a fraction of the mutations, and at most. Their mean gives the
-#: brightness of the chains' image.
-_BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
+#: The number of bootstrap samples, as a fraction of the mutations, and its maximum. Their mean
+#: gives the brightness of the chains' image.
+_BOOTSTRAP_SHARE, _MAX_BOOTSTRAP = 0.25, 1 << 24
 
 #: With a time limit: the fraction of the remaining time that the bootstrap takes, and the number of
 #: samples that measure its speed.
 _BOOTSTRAP_TIME, _SPEED_SAMPLES = 0.2, 1 << 16
 
-#: A larger relative standard error of the brightness gives a warning.
-_UNSURE = 0.05
+#: The relative standard error of the brightness above which there is a warning.
+_MAX_BRIGHTNESS_ERROR = 0.05
 
-#: A state that a chain visits more often than this in a row gives a warning: both more often than
-#: this number, and than this fraction of the visits of an average pixel.
-_LONG, _STAY = 64, 0.5
+#: The number of consecutive visits of a chain to a state above which there is a warning: an
+#: absolute number, and a fraction of the visits of an average pixel; both must be exceeded.
+_LONG_STAY, _LONG_STAY_FRACTION = 64, 0.5
 
-#: Samples that estimate the scale of MIS weights.
+#: The number of samples that estimate the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
 
 
@@ -52,14 +52,15 @@ class ChainSettings:
     """The parameters of a Metropolis render.
 
     Attributes:
-        chains: Largest number of chains; there are never more than mutations. 0 for a number that
-            suits the render.
-        bootstrap: Least number of samples from which the starts are chosen.
+        chains: The maximum number of chains, which never exceeds the number of mutations; 0 for a
+            number that suits the render.
+        bootstrap: The minimum number of samples from which the starts are chosen.
         large_step: The probability of a large step.
         steps: The small steps.
-        uses_uniform: Are the proposals of large steps also used as independent samples?
-        is_even: Is there a first stage, whose samples make the visits even over the film?
-        file: If it holds a state, the render continues from it. The last state is saved to it.
+        uses_uniform: Whether the proposals of large steps are also used as independent samples.
+        is_even: Whether there is a first stage, whose samples make the visits even over the film.
+        file: The file to which the last state is saved. If it holds a state, the render continues
+            from it.
     """
 
     chains: int
@@ -73,11 +74,11 @@ class ChainSettings:
 
 @dataclass(frozen=True)
 class Start:
-    """The samples from which chains started.
+    """The samples at which chains started.
 
     Attributes:
-        mean: Mean of the target function.
-        count: Number of samples.
+        mean: The mean of the target function.
+        count: The number of samples.
         error: The standard error of the mean, divided by the mean.
     """
 
@@ -88,7 +89,7 @@ class Start:
 
 class MetropolisRender(ChainRender):
     """Metropolis light transport: long chains visit the film in proportion to the brightness of the
-    image. ``spp`` are mutations per pixel.
+    image. ``spp`` is the number of mutations per pixel.
 
     Parameters:
         settings: The parameters of the chains.
@@ -137,19 +138,19 @@ class MetropolisRender(ChainRender):
             if chains.done > 0:
                 chains.end()
                 self._write(chains, image, start)
-        # Not after an error: the chains may be amid a launch
+        # Not after an error, when the chains may be amid a launch
         if file:
             file.save(self._stored(chains, image, start))
 
     def _begun(
         self, total: int, image: ChainImage, interrupt: threading.Event
     ) -> tuple[Chains | None, Start]:
-        """New chains and their start; ``None`` instead of chains if no light was found."""
+        """New chains and their start; ``None`` instead of the chains if no light was found."""
         settings, statistics = self._settings, self._statistics
         count = min(settings.chains or _suitable(total, self._target), total)
         mean = self._first_stage()
         samples = max(settings.bootstrap, count, self._bootstrap_share(total))
-        # Independent samples for each mutation: those of large steps and of the bootstrap
+        # Independent samples per mutation, from large steps and from the bootstrap
         share = settings.large_step + _BOOTSTRAP_SHARE
         rules = ChainRules(
             settings.large_step, settings.steps, share * mean if settings.uses_uniform else 0.0
@@ -159,7 +160,7 @@ class MetropolisRender(ChainRender):
             if interrupt.is_set() or self._integrator.is_cancelled:
                 raise _StoppedError
             if rules.uniform_weight > 0:
-                # Opaque, since a literal would need another kernel in each render
+                # Opaque, because a literal would need another kernel in each render
                 scale = dr.opaque(mi.Float, rules.uniform_weight)
                 weight = dr.select(found.target > 0, dr.rcp(found.target + scale), 0)
                 image.add_found(found, weight)
@@ -202,8 +203,8 @@ class MetropolisRender(ChainRender):
 
     def _first_stage(self) -> float:
         """Estimates the mean of the target function, which scales MIS weights. Any scale is
-        unbiased if it does not depend on the samples of the image. Computes the weights of tiles
-        too."""
+        unbiased if it does not depend on the samples of the image. Also computes the weights of
+        tiles."""
         settings = self._settings
         seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
         self._target.learn(seed)
@@ -218,16 +219,16 @@ class MetropolisRender(ChainRender):
         share = int(_BOOTSTRAP_SHARE * total)
         if self._integrator.timeout > 0 and share > self._settings.bootstrap:
             share = min(share, self._timed_share())
-        return min(share, _MOST_BOOTSTRAP)
+        return min(share, _MAX_BOOTSTRAP)
 
     def _timed_share(self) -> int:
         """The number of bootstrap samples that suits the time limit. Separate samples measure the
-        speed: the number of samples that are used must not depend on their values."""
+        speed, because the number of samples used must not depend on their values."""
         # The first stage has compiled the kernels
         begin = time.perf_counter()
         seed = stream(self._seed, FIRST_STAGE)
         count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
-        # The clock may measure 0 seconds, which must not divide
+        # The clock may measure 0 seconds, which must not be a divisor
         seconds = max(time.perf_counter() - begin, 1e-6)
         left = self._integrator.timeout - (time.perf_counter() - self._start)
         return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
@@ -235,8 +236,8 @@ class MetropolisRender(ChainRender):
     def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count
         camera_samples = self._pixel_count * self._camera_spp
-        # The mean of the samples from which the chains started, not a more precise one: the product
-        # with the visits is unbiased only with this mean
+        # The mean of the samples at which the chains started, not a more precise one: only with
+        # this mean is the product with the visits unbiased
         visit_factor = start.mean * camera_samples / mutations
         uniform = self._settings.large_step * mutations + start.count
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
@@ -247,13 +248,13 @@ class MetropolisRender(ChainRender):
             f"{self._rates()}; brightness known to {start.error:.1%}; a chain stayed at one path "
             f"for {longest:.0f} of {chains.done} mutations"
         )
-        if longest > max(_LONG, _STAY * mutations / self._pixel_count):
+        if longest > max(_LONG_STAY, _LONG_STAY_FRACTION * mutations / self._pixel_count):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"A chain stayed at one path for {longest:.0f} of {chains.done} mutations: some "
                 f'pixels may be far too bright. "erpt" limits the contribution of one path.',
             )
-        if start.error > _UNSURE:
+        if start.error > _MAX_BRIGHTNESS_ERROR:
             mi.Log(
                 mi.LogLevel.Warn,
                 f"The light that the chains found may be too bright or too dark as a whole: the "
@@ -263,11 +264,11 @@ class MetropolisRender(ChainRender):
 
 
 class _StoppedError(Exception):
-    """The render was interrupted, or cancelled."""
+    """The render was interrupted or cancelled."""
 
 
 def _suitable(mutations: int, target: ImageTarget) -> int:
-    """A suitable number of chains. Longer chains depend less on where they began. More chains keep
-    the processor busy, above all if each mutation is several kernels."""
+    """A suitable number of chains. Longer chains depend less on their starts. More chains keep the
+    processor busy, especially if each mutation consists of several kernels."""
     fewest, most = _CHAINS[target.has_light_paths]
     return min(max(mutations // _LENGTH[target.has_light_paths], fewest), most)

@@ -14,15 +14,15 @@ from .layers import LayerSums
 
 
 def denoised(sums: LayerSums, size: Size) -> LayerSums:
-    """A layer whose colours Open Image Denoise has denoised, guided by albedo and normal.
+    """A layer with colours denoised by Open Image Denoise, guided by albedo and normal.
 
-    For a picture that a lens has blurred, a denoiser works less well, as its guides are blurred and
-    noisy too. Before the filter, the guides are sharp. Holes of the layer are filled in first, so
-    that they have no edges. Pixels that show a light are unchanged.
+    A denoiser works less well on an image blurred by a lens, because its guides are also blurred
+    and noisy. Before the filter, the guides are sharp. Holes of the layer are filled first, so that
+    they have no edges. Pixels that show a light are unchanged.
 
     Parameters:
         sums: The layer, with guides.
-        size: Size of the layer.
+        size: The size of the layer.
 
     Raises:
         InstallationError: The package ``mitsuba-oidn`` is missing.
@@ -44,5 +44,5 @@ def denoised(sums: LayerSums, size: Size) -> LayerSums:
     ))  # fmt: skip
     found = mi.Color3f(np.ascontiguousarray(result.reshape(-1, 3).T))
     found *= dr.select(is_known, sums.hits, 0)
-    # Lights have no noise, and a denoiser makes small ones brighter
+    # Lights have no noise, and a denoiser would brighten small ones
     return replace(sums, color=dr.select(sums.guides[6] > 0, sums.color, found))

@@ -1,5 +1,5 @@
-"""The effective circle of confusion: the picture that a lens makes of three layers, as the source
-approximates it."""
+"""The effective circle of confusion: the source's approximation to the image of three layers
+through a lens."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from .near_field import near_field
 def effective_filter(
     near: Layer | None, rest: list[Layer], size: Size, cap: float
 ) -> mi.Color3f:
-    """The picture that a thin lens makes of a near, an in-focus and a far layer.
+    """The image of a near, an in-focus and a far layer through a thin lens.
 
     The near layer is blurred by a separable filter of one radius, ``cap``. Its opacity α is the
-    part of the lens that it hides from the layers behind it. A pixel of these is the mean over its
-    effective circle of confusion, at 48 points: the circle of its own blur, smaller by the factor
+    fraction of the lens that it hides from the layers behind it. A pixel of these layers is the
+    mean over its effective circle of confusion, at 48 points: the circle of its own blur, scaled by
     1 - α, with its centre moved towards the near objects.
 
-    A straight edge that hides the share α of the lens' width leaves a part whose centre is α away
-    from that of the lens. The circle is therefore moved by α times the radius of the whole one. The
-    source moves it by α times the effective radius, which is α (1 - α) of the whole one: that
-    agrees for small α only. Surfaces that are nearer than the focus themselves are seen on the
-    other side of the lens: their circle is moved away from the near objects.
+    A straight edge that hides the fraction α of the lens's width leaves a part whose centre lies at
+    a distance α from the centre of the lens. The circle is therefore moved by α times the full
+    radius. The source moves it by α times the effective radius, which is α (1 - α) times the full
+    radius: the two agree only for small α. Surfaces nearer than the focus are seen on the other
+    side of the lens, so their circle is moved away from the near objects.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.4 and 5.5.
 
     Parameters:
         near: The near layer; ``None`` if there is none.
-        rest: The other layers, the nearest first.
-        size: Size of the pictures.
-        cap: Radius of the near layer's blur, in pixels.
+        rest: The other layers, nearest first.
+        size: The size of the images.
+        cap: The radius of the near layer's blur, in pixels.
     """
     lens = LensPoints(ring_points())
     index, position = size.pixels()
@@ -58,8 +58,8 @@ def effective_filter(
 
 
 def effective_limits(blurs: np.ndarray) -> tuple[Limits, float]:
-    """The limits between the near, the in-focus and the far layer, and the radius of the blur of
-    the near one: the median of its surfaces.
+    """The limits between the near, the in-focus and the far layer, and the blur radius of the near
+    layer: the median over its surfaces.
 
     Parameters:
         blurs: Signed radii in pixels of the visible surfaces; any sample of the pixels.

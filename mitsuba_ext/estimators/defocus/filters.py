@@ -1,4 +1,4 @@
-"""The filters of this folder by name, with one interface."""
+"""The filters of this folder, by name, with a common interface."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .thin_lens import ThinLens
 
 @dataclass
 class Capture:
-    """The picture seen from the middle of the lens, in layers.
+    """The image seen from the centre of the lens, in layers.
 
     Attributes:
-        size: Size of the picture.
+        size: The size of the image.
         sums: The sums of each layer.
-        blur: Signed radius of the circle of confusion of the first surface, in pixels.
+        blur: The signed radius of the circle of confusion of the first surface, in pixels.
     """
 
     size: Size
@@ -33,10 +33,10 @@ class Capture:
 
 
 class Filter(Protocol):
-    """Makes the picture of a lens from the one seen from its middle.
+    """Makes the image through a lens from the image seen from its centre.
 
     Attributes:
-        has_layers: Does it use surfaces behind the first one?
+        has_layers: Whether it uses surfaces behind the first one.
     """
 
     has_layers: bool
@@ -45,7 +45,7 @@ class Filter(Protocol):
         """The limits of the layers, for surfaces with these blurs."""
 
     def picture(self, capture: Capture) -> mi.Color3f:
-        """The picture. Called after :meth:`limits`."""
+        """The image through the lens. Called after :meth:`limits`."""
 
 
 class _Lens:
@@ -73,25 +73,26 @@ class _Effective:
         return effective_filter(near, layers, capture.size, self._cap)
 
 
-#: The filters by name. A benchmark adds others, to compare with them.
+#: The filters by name. A benchmark adds others for comparison.
 FILTERS: dict[str, Callable[[], Filter]] = {"lens": _Lens, "effective": _Effective}
 
 
 def defocus(
     color: mi.TensorXf, depth: mi.TensorXf, lens: ThinLens, filter: str = "lens"
 ) -> mi.TensorXf:
-    """The picture that a lens makes, from the one seen from its middle.
+    """The image through a lens, from the image seen from its centre.
 
-    Surfaces hidden behind near objects are filled in from the visible ones around them.
+    Surfaces hidden behind near objects are filled in from visible surfaces around them.
 
     Parameters:
-        color: RGB of any range, [y, x, 3].
+        color: RGB in any range, [y, x, 3].
         depth: Depth along the axis of the lens, positive, [y, x]; infinite for the sky.
-        lens: The lens. Its ``film_width`` is that of the picture, or larger if that is a crop.
+        lens: The lens. Its ``film_width`` is the width of the image, or larger if the image is a
+            crop.
         filter: One of ``FILTERS``.
 
     Raises:
-        ValueError: The shapes do not match, or there is no such filter.
+        ValueError: The shapes do not match, or the filter is unknown.
     """
     height, width, *rest = color.shape
     if rest != [3] or tuple(depth.shape) != (height, width):

@@ -1,4 +1,4 @@
-"""Highlights: small bright spots out of focus. Each is spread over its circle of confusion, as the
+"""Highlights: small bright spots out of focus. Each is spread over its circle of confusion, because
 gathering at points of the lens would miss it from most pixels."""
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from ...util.arrays import from_numpy
 from .images import Pyramid, Size, rgb
 from .layers import Layer
 
-#: A highlight is at least this many times as bright as the mean over the square that its circle of
-#: confusion would fill, in the sum of all layers. The bright half of a pattern has less.
-_BRIGHTER = 3.0
+#: The minimum brightness of a highlight, relative to the mean over the square that its circle of
+#: confusion would fill, in the sum of all layers. The bright half of a pattern has a smaller ratio.
+_MIN_CONTRAST = 3.0
 
-#: Highlights with circles of a smaller radius, in pixels, are left to the points of the lens.
-_LEAST_RADIUS = 2.0
+#: The minimum radius of a highlight's circle of confusion, in pixels. Gathering at the points of
+#: the lens handles smaller ones.
+_MIN_RADIUS = 2.0
 
-#: The most pixels that all highlights together cover, per pixel of the picture.
-_MOST_COVERED = 8
+#: The maximum number of pixels that all highlights together cover, per pixel of the image.
+_MAX_COVERED = 8
 
-#: Returns the transmittance of layers; called with the indices of pixels, their centres, and points
-#: of the lens.
+#: A function of the indices of pixels, their centres, and points of the lens that returns the
+#: transmittance of layers.
 Visibility = Callable[..., "mi.Float"]
 
 
 @dataclass
 class Highlights:
-    """The pixels of a layer that are spread.
+    """The pixels of a layer that are spread as highlights.
 
     Attributes:
-        pixel: Their indices.
-        blur: Signed radii of their circles of confusion in pixels, not 0.
-        excess: RGB by which they are brighter than their surroundings.
+        pixel: The indices of the pixels.
+        blur: The signed radii of their circles of confusion in pixels, not 0.
+        excess: The RGB excess over their surroundings.
     """
 
     pixel: mi.UInt32
@@ -50,13 +51,12 @@ def without_highlights(
 ) -> tuple[mi.Float, Highlights | None]:
     """Divides a layer into its colours without highlights, and the highlights (``None`` if there
     are none). With gathering alone, the 48 lens points of one pixel would hit a bright pixel, and
-    those of the next one would miss it.
+    the points of the next pixel would miss it.
 
     Parameters:
         layer: The layer.
         around: The pyramid of the sum of all layers.
-        size: Size of the picture.
-    """
+        size: The size of the image. """
     glow = layer.glow if layer.glow is not None else layer.blur
     found = dr.compress(_Pixels(layer, glow, around, size, size.pixels()[0]).is_bright())
     if len(found) == 0:
@@ -64,7 +64,7 @@ def without_highlights(
     pixels = _Pixels(layer, glow, around, size, found)
     # The darkest of the squares around a highlight shows the brightness without it
     excess = rgb(pixels.color) * (1 - pixels.darkest() / pixels.bright)
-    # Highlights that the layer before contains too are removed here, but not spread twice
+    # Highlights that the previous layer also contains are removed here, but not spread twice
     is_shared = pixels.blur > dr.opaque(mi.Float, layer.shared)
     radius, blur = dr.select(is_shared, 0, pixels.radius), pixels.blur
     dr.eval(excess, radius, blur)
@@ -72,7 +72,7 @@ def without_highlights(
     is_gone = dr.select(is_shared, mi.Float(1), 0)
     if len(spread_ones) > 0:
         dr.scatter(is_gone, mi.Float(1), spread_ones)
-    # A copy, as the pyramid uses the original array
+    # A copy, because the pyramid uses the original array
     rest = dr.copy(layer.color)
     for k, channel in enumerate(excess):
         dr.scatter_add(rest, -channel * is_gone, 4 * found + k)
@@ -100,9 +100,9 @@ class _Pixels:
         self._middle = mi.Point2f(size.position(index)) + 0.5
 
     def is_bright(self) -> mi.Bool:
-        """Is the pixel a highlight: much brighter than the square around it?"""
-        limit = dr.maximum(_BRIGHTER * self._square(0, 0), 0)
-        return (self.radius > _LEAST_RADIUS) & (self.bright > limit)
+        """Whether the pixel is a highlight: much brighter than the square around it."""
+        limit = dr.maximum(_MIN_CONTRAST * self._square(0, 0), 0)
+        return (self.radius > _MIN_RADIUS) & (self.bright > limit)
 
     def darkest(self) -> mi.Float:
         """The brightness of the darkest of the nine squares at and around the pixel."""
@@ -115,16 +115,16 @@ class _Pixels:
 
     def _square(self, x: int, y: int) -> mi.Float:
         color = self._view.at(self._middle + self._step * mi.Vector2f(x, y))
-        # Colours are multiplied by coverage: scale that of the square to the coverage of the pixel
+        # Colours are multiplied by coverage: scale the square's colour to the coverage of the pixel
         return self.color.w * _brightness(color) / dr.maximum(color.w, 1e-6)
 
 
 def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Visibility) -> None:
-    """Adds highlights to a picture: each to the pixels of its circle of confusion, attenuated by
-    the layers in front of it.
+    """Adds highlights to an image: each to the pixels of its circle of confusion, attenuated by the
+    layers in front of it.
 
     Parameters:
-        picture: RGB of each pixel, row by row.
+        picture: The RGB of each pixel, row by row.
         highlights: The highlights of a layer.
         size: Size of the picture.
         visibility: The transmittance of the layers in front.
@@ -135,14 +135,14 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
 
 
 def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
-    """The indices of the highlights to spread, out of those with a radius above 0: if all of them
-    cover too many pixels, those with the largest brightness per covered pixel."""
+    """The indices of the highlights to spread, out of the highlights with a radius above 0: if all
+    of them would cover too many pixels, those with the largest brightness per covered pixel."""
     covered = math.pi * np.square(radius.numpy())
     order = np.flatnonzero(covered)
-    if covered.sum() > _MOST_COVERED * size.count:
+    if covered.sum() > _MAX_COVERED * size.count:
         bright = dr.sum(excess).numpy()
         order = order[np.argsort(-bright[order] / covered[order], kind="stable")]
-        order = order[np.cumsum(covered[order]) <= _MOST_COVERED * size.count]
+        order = order[np.cumsum(covered[order]) <= _MAX_COVERED * size.count]
     return from_numpy(mi.UInt32, np.sort(order))
 
 
@@ -155,7 +155,8 @@ def _spread(picture, position, blur, excess, size, visibility):
     radius = dr.abs(blur)
     reach = mi.Int32(dr.ceil(radius + 0.5))
     side = 2 * reach + 1
-    # Normalize by the sum over pixels, which differs from the area of the disk: no light is lost
+    # Normalize by the sum over pixels, which differs from the area of the disk, so that no light is
+    # lost
     i, total = mi.Int32(0), mi.Float(0)
     while i < side * side:
         total += _coverage(mi.Vector2i(i % side, i // side) - reach, radius)
@@ -167,7 +168,7 @@ def _spread(picture, position, blur, excess, size, visibility):
         at = position + offset
         active = (weight > 0) & size.contains(at)
         index = size.index(at)
-        # The point of the lens through which the pixel `at` sees the highlight
+        # The point of the lens through which the pixel ``at`` sees the highlight
         point = -mi.Point2f(offset) / blur
         light = excess * (weight / total * visibility(index, mi.Point2f(at) + 0.5, point))
         for c in range(3):

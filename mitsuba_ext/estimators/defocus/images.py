@@ -1,4 +1,4 @@
-"""Images as flat arrays, with four numbers for each pixel, and their pyramids."""
+"""Images as flat arrays with four numbers per pixel, and their pyramids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 @dataclass
 class Size:
-    """Width and height of an image in pixels. Kernels do not depend on them."""
+    """The width and height of an image in pixels. Kernels do not depend on them."""
 
     width: int
     height: int
@@ -25,7 +25,7 @@ class Size:
         self._last = dr.opaque(mi.Vector2i, [self.width - 1, self.height - 1])
 
     def contains(self, position: mi.Vector2i) -> mi.Bool:
-        """Is there a pixel at a position?"""
+        """Whether there is a pixel at a position."""
         return dr.all((position >= 0) & (position <= self._last))
 
     def pixels(self) -> tuple[mi.UInt32, mi.Vector2i]:
@@ -34,12 +34,12 @@ class Size:
         return index, self.position(index)
 
     def position(self, index: mi.UInt32) -> mi.Vector2i:
-        """The position of the pixel with an index."""
+        """The position of the pixel with this index."""
         y = index // self._width
         return mi.Vector2i(mi.Int32(index - y * self._width), mi.Int32(y))
 
     def index(self, position: mi.Vector2i) -> mi.UInt32:
-        """The index of the pixel at a position, or of the nearest one at the border."""
+        """The index of the pixel at a position, or of the nearest pixel at the border."""
         position = dr.clip(position, 0, self._last)
         return mi.UInt32(position.y) * self._width + mi.UInt32(position.x)
 
@@ -48,12 +48,12 @@ class Size:
 
 
 class Pyramid:
-    """An image, and copies of half, a quarter, … of its size: means of 2 × 2 pixels.
+    """An image, with copies of half, a quarter, … of its size: means of 2 × 2 pixels.
 
     Parameters:
         data: The image: 4 numbers for each pixel, row by row.
-        size: Its size.
-        most_levels: The most levels, the image included.
+        size: The size of the image.
+        most_levels: The maximum number of levels, including the image.
     """
 
     def __init__(self, data: mi.Float, size: Size, most_levels: int = 12) -> None:
@@ -65,7 +65,8 @@ class Pyramid:
         for level in sizes:
             starts.append(starts[-1] + level.count)
         self.level_count = len(sizes)
-        # Levels are separate arrays first: Dr.Jit would copy one array that is read and written
+        # Levels are separate arrays at first: Dr.Jit would copy an array that is both read and
+        # written
         copies = [data]
         for level in sizes[:-1]:
             copies.append(dr.ravel(halved(mi.Vector4f, copies[-1], level)))
@@ -84,7 +85,7 @@ class Pyramid:
         return result
 
     def view(self, level: mi.UInt32) -> LevelView:
-        """A view of a level, which can differ from lane to lane."""
+        """A view of a level, which can differ between lanes."""
         return LevelView(
             self._data, dr.gather(mi.UInt32, self._starts, level),
             dr.gather(mi.Int32, self._widths, level), dr.gather(mi.Int32, self._heights, level),
@@ -103,7 +104,7 @@ class LevelView:
     scale: mi.Float
 
     def at(self, place: mi.Point2f) -> mi.Vector4f:
-        """The pixel at a place, given in pixels of the whole image from its corner; beyond the
+        """The pixel at a place, given in pixels of the full-size image from its corner; beyond the
         border, the nearest pixel."""
         column = dr.clip(mi.Int32(dr.floor(place.x * self.scale)), 0, self.width - 1)
         row = dr.clip(mi.Int32(dr.floor(place.y * self.scale)), 0, self.height - 1)
@@ -136,13 +137,13 @@ def bilinear(kind: type[T], flat: mi.Float, size: Size, place: mi.Point2f) -> T:
 
 
 def filled(kind: type, values: mi.Float, weight: mi.Float, size: Size) -> mi.Float:
-    """Fills the holes of an image: where ``weight`` is below 1, means of the pixels around are
+    """Fills the holes of an image: where ``weight`` is below 1, means of surrounding pixels are
     added with the missing weight (Gortler et al., *The Lumigraph*, SIGGRAPH 1996: pull and push).
 
     Parameters:
         kind: The type of a pixel: ``mi.Float`` or ``mi.Vector4f``.
         values: The numbers of each pixel, row by row, already multiplied by its ``weight``.
-        weight: How much is known of each pixel, in [0, 1].
+        weight: The known fraction of each pixel, in [0, 1].
         size: Size of the image.
 
     Returns:
@@ -155,7 +156,7 @@ def filled(kind: type, values: mi.Float, weight: mi.Float, size: Size) -> mi.Flo
         _index, position = size.half().pixels()
         total, known = kind(0), mi.Float(0)
         for at in _four(size, 2 * position):
-            # Beyond the border, the pixel at the border is used again
+            # Beyond the border, the border pixel is reused
             total += dr.gather(kind, flat, at)
             known += dr.gather(mi.Float, weight, at)
         # The weight of the four together is at most 1

@@ -1,4 +1,4 @@
-"""Image blocks for the samples of layers."""
+"""Image blocks for samples of layers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .images import Size
 from .layers import LayerSums, Limits
 from .pinhole import Surface
 
-#: Channels of each layer: RGB, alpha, blur, hits, blur times brightness; and channels of a
+#: The numbers of channels of each layer (RGB, alpha, blur, hits, blur times brightness) and of a
 #: denoiser's features.
 _VALUES, _GUIDES = 7, 7
 
@@ -20,9 +20,9 @@ class LayerBlocks:
     Parameters:
         film: The film whose reconstruction filter is used. With guides, a box filter is used
             instead, because a denoiser mistakes noise that neighbouring pixels share for detail.
-        size, offset: Size of the blocks, and position of their corner on the film.
+        size, offset: The size of the blocks, and the position of their corner on the film.
         limits: The limits of the layers.
-        has_guides: Do surfaces have the features of a denoiser (:attr:`Surface.guides`)?
+        has_guides: Whether surfaces have the features of a denoiser (:attr:`Surface.guides`).
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class LayerBlocks:
 
         Parameters:
             surface: The surface that each sample hit.
-            behind: Samples are only added to layers behind the layer of this blur; infinity for all
-                layers.
+            behind: The blur of a layer: samples are added only to layers behind it; infinity for
+                all layers.
         """
         known, blur = [], surface.blur
         for k, block in enumerate(self._hits):
@@ -75,7 +75,7 @@ class LayerBlocks:
         return [block.tensor() for block in (*self._hits, self._known)]
 
     def sums(self) -> tuple[list[LayerSums], list[mi.Float]]:
-        """The sums of each layer, and those of alpha."""
+        """The sums of each layer, and the sums of alpha."""
         known = self._known.tensor()
         count, channels = self.limits.layer_count, self._channels
         lane = dr.arange(mi.UInt32, len(known.array) // count)

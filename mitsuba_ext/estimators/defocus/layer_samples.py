@@ -1,24 +1,24 @@
-"""The pixels of a layered render that take samples of surfaces that are hidden, or outside of the
-film."""
+"""Chooses the pixels of a layered render that take samples of hidden surfaces or of surfaces
+outside the film."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Edge of tiles, in pixels: the decisions are made for all pixels of a tile together.
+#: The edge of a tile, in pixels. Decisions are made for all pixels of a tile together.
 TILE = 8
 
-#: If the blurs of neighbouring pixels differ by more than this, in pixels, there is an edge at
-#: which one surface hides another.
-_EDGE = 0.5
+#: The difference between the blurs of neighbouring pixels, in pixels, above which one surface hides
+#: another there.
+_EDGE_STEP = 0.5
 
 
 def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
-    """The pixels of the margin around the film that are blurred into the film, and, approximately
-    by tiles, those into which pixels of the film are blurred.
+    """The pixels of the margin around the film that are blurred into the film, and (approximated by
+    tiles) the pixels into which the film is blurred.
 
     Parameters:
-        blurs: Blur of each pixel, margin included, [height, width].
+        blurs: The blur of each pixel, including the margin, [height, width].
     """
     height, width = blurs.shape
     outside = np.ones((height, width), dtype=bool)
@@ -40,7 +40,7 @@ def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
 
 
 def _spread(reach: np.ndarray) -> np.ndarray:
-    """For each tile, the largest reach, in pixels, of the tiles that reach it; 0 if none does."""
+    """For each tile, the largest reach, in pixels, of all tiles that reach it; 0 if none does."""
     steps = np.ceil(reach / TILE)
     found = np.zeros_like(reach)
     for step in range(int(steps.max()), 0, -1):
@@ -49,9 +49,9 @@ def _spread(reach: np.ndarray) -> np.ndarray:
 
 
 def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
-    """For each pixel, the smallest blur, which is that of the farthest surface, at edges so near
-    that the lens may see this surface behind the pixel; infinity if there is no such edge. It is
-    computed for tiles.
+    """For each pixel, the smallest blur, which belongs to the farthest surface, at edges near
+    enough for the lens to see this surface behind the pixel; infinity if there is no such edge.
+    Computed by tiles.
 
     Parameters:
         blurs: Signed blur radii in pixels, [height, width].
@@ -61,7 +61,7 @@ def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
     for axis in range(2):
         a = np.moveaxis(blurs, axis, 0)
         e = np.moveaxis(edge, axis, 0)
-        jump = np.abs(a[1:] - a[:-1]) > _EDGE
+        jump = np.abs(a[1:] - a[:-1]) > _EDGE_STEP
         least = np.where(jump, np.minimum(a[1:], a[:-1]), np.inf)
         e[1:] = np.minimum(e[1:], least)
         e[:-1] = np.minimum(e[:-1], least)

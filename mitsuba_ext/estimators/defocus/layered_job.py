@@ -1,4 +1,4 @@
-"""Defocus by layers: a render from the middle of the lens, whose layers a filter blurs."""
+"""Defocus by layers: a render from the centre of the lens, whose layers a filter blurs."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from .layer_samples import distance_from_film, least_blur_around, outside_pixels
 from .layers import LayerSums
 from .pinhole import PinholeView, Surface
 
-#: Surfaces outside of the film are blurred into it. Samples are taken in a margin of at most this
-#: width, in units of the film's longer edge; everything beyond is assumed to look like the edge of
-#: the margin. With 1/8, corners are wrong under wide lenses; 1/2 costs 1.7 times as much and gains
-#: little.
-_WIDEST_MARGIN = 1 / 4
+#: The maximum width of the margin in which samples are taken of surfaces outside the film that are
+#: blurred into it, in units of the film's longer edge. Everything beyond is assumed to look like
+#: the edge of the margin. With 1/8, corners are wrong with wide lenses; 1/2 costs 1.7 times as much
+#: and gains little.
+_MAX_MARGIN = 1 / 4
 
-#: The bit that marks pixels, in a list, whose hidden surfaces are sampled.
-_HIDDEN = 0x80000000
+#: The bit that marks the pixels in a list whose hidden surfaces are sampled.
+_HIDDEN_BIT = 0x80000000
 
-#: Largest number of samples of a pass over a list of pixels.
-_MOST_LANES = 1 << 21
+#: The maximum number of samples in a pass over a list of pixels.
+_MAX_LANES = 1 << 21
 
 
 class LayeredJob(Job):
-    """One render of :class:`~mitsuba_ext.integrators.ecoc_dof`.
+    """A render by :class:`~mitsuba_ext.integrators.ecoc_dof`.
 
-    The stages take samples of the nested integrator along rays from the middle of the lens. Then
+    The stages take samples of the nested integrator along rays from the centre of the lens. Then,
     ``integrator.hidden_samples`` samples per pixel are taken of hidden surfaces, where the lens
-    sees a part of them, and of surfaces outside of the film. A filter computes the picture.
+    sees part of them, and of surfaces outside the film. A filter computes the image.
     """
 
     #: The samples are also put into layers.
@@ -59,12 +59,12 @@ class LayeredJob(Job):
         self.filter = FILTERS[integrator.filter]()
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
-        self.margin = math.ceil(_WIDEST_MARGIN * max(self._crop))
+        self.margin = math.ceil(_MAX_MARGIN * max(self._crop))
         self.size = self._with_margin()
         self.blurs = self._blurs()
         self._trim()
         offset = [int(n) - self.margin for n in self.film.crop_offset()]
-        # If the sky is not seen, the scene may be a closed room, with nothing behind its walls
+        # If the sky is not visible, the scene may be a closed room, with nothing behind its walls
         self._sees_sky = bool((self.blurs == np.float32(self.lens.blur_of_sky)).any())
         limits = self.filter.limits(self.blurs.ravel())
         self.layers = LayerBlocks(self.film, self.size, offset, limits, integrator.denoise)
@@ -82,7 +82,7 @@ class LayeredJob(Job):
         return self.view.first(ray).blur.numpy().reshape(self.size.height, self.size.width)
 
     def _trim(self) -> None:
-        """Reduces the margin to the width that is blurred into the film, or into which the film is
+        """Reduces the margin to the width that is blurred into the film or into which the film is
         blurred."""
         margin, film = self.margin, self.blurs[self._inside]
         distance = distance_from_film(self.blurs.shape, margin)
@@ -101,8 +101,8 @@ class LayeredJob(Job):
         return slice(m, m + height), slice(m, m + width)
 
     def _sample(self, stage, sampler, rays: CameraRays, count=1.0) -> Sample:
-        # Before the samples are put into the block: tracing the null transmission of textures
-        # evaluates arrays, which would also evaluate the pending samples, in another kernel
+        # Before samples are added to the block: tracing the null transmission of textures evaluates
+        # arrays, which would also evaluate the pending samples, in another kernel
         first = self.view.first(rays.ray)
         sample = super()._sample(stage, sampler, rays, count)
         self._put(rays, sample, first, mi.Float(rays.weight * count), mi.Bool(True))
@@ -125,11 +125,11 @@ class LayeredJob(Job):
         if not self._stopped(interrupt):
             self._run_besides(interrupt)
 
-    # ---- Surfaces that are hidden, or outside of the film ----
+    # ---- Surfaces that are hidden or outside the film ----
 
     def _run_besides(self, interrupt) -> None:
-        """Takes samples of surfaces outside of the film, and of hidden surfaces: where the blur of
-        the surface in front is larger by more than 1 than that of the farthest surface around."""
+        """Takes samples of surfaces outside the film, and of hidden surfaces: where the blur of the
+        front surface exceeds the blur of the farthest surface around by more than 1."""
         count = self.integrator.hidden_samples(self.statistics.spp)
         self._weight = dr.opaque(mi.Float, self.statistics.spp / count)
         pixels = np.flatnonzero(outside_pixels(self.blurs, self.margin)).astype(np.uint32)
@@ -137,11 +137,11 @@ class LayeredJob(Job):
             least = least_blur_around(self.blurs, self.lens.blur_of_sky)
             self._least = from_numpy(mi.Float, least)
             hidden = np.flatnonzero(np.isfinite(least)).astype(np.uint32)
-            pixels = np.concatenate([pixels, hidden | _HIDDEN])
+            pixels = np.concatenate([pixels, hidden | _HIDDEN_BIT])
         if len(pixels) == 0:
             return
         # Passes of about equal length; neighbouring lanes have neighbouring pixels
-        most = min(_MOST_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
+        most = min(_MAX_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
         passes = -(-len(pixels) // max(1, most // count))
         for number, part in enumerate(np.array_split(pixels, passes)):
             if self._stopped(interrupt):
@@ -158,7 +158,7 @@ class LayeredJob(Job):
         seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(0x80000000 + number))[0]
         sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(lane))
         chosen = dr.gather(mi.UInt32, pixels, place)
-        pixel, is_hidden = chosen & (_HIDDEN - 1), chosen >= _HIDDEN
+        pixel, is_hidden = chosen & (_HIDDEN_BIT - 1), chosen >= _HIDDEN_BIT
         lanes = self._lanes_with_margin(pixel, lane - place * dr.opaque(mi.UInt32, count))
         rays = self._rays(stage, sampler, lanes)
         surface, active, behind = self._surface(rays, pixel, is_hidden)
@@ -170,9 +170,9 @@ class LayeredJob(Job):
     def _surface(
         self, rays: CameraRays, pixel: mi.UInt32, is_hidden: mi.Bool
     ) -> tuple[Surface, mi.Bool, mi.Float | None]:
-        """The first surface along a ray; the surface hidden by it where ``is_hidden``, and then the
+        """The first surface along a ray; where ``is_hidden``, the surface hidden by it, and the
         ray's origin is moved behind the first surface. Also returns the lanes that have a surface,
-        and the blur of the surface in front (infinite where not ``is_hidden``)."""
+        and the blur of the front surface (infinite where not ``is_hidden``)."""
         first = self.view.first(rays.ray)
         if not self.filter.has_layers:
             return first, mi.Bool(True), None
@@ -185,8 +185,8 @@ class LayeredJob(Job):
         return dr.select(is_hidden, hidden, first), active | ~is_hidden, behind
 
     def _lanes_with_margin(self, pixel: mi.UInt32, index: mi.UInt32) -> camera.Lanes:
-        """Lanes for pixels of the film and its margin. Their ``pixel`` is the nearest one of the
-        film, since the nested integrator may have tables with an entry for each pixel of the
+        """Lanes for pixels of the film and its margin. Their ``pixel`` is the nearest pixel of the
+        film, because the nested integrator may have tables with an entry for each pixel of the
         film."""
         corner = self.size.position(pixel) - self.margin
         border = self.film.rfilter().border_size() if self.film.sample_border() else 0
@@ -203,7 +203,7 @@ class LayeredJob(Job):
         super().fill_film()
 
     def _put_picture(self) -> None:
-        """Replaces colours and alpha of the block by those of the blurred layers."""
+        """Replaces the block's colours and alpha with the blurred layers."""
         sums, alphas = self.layers.sums()
         if self.integrator.denoise:
             sums = [denoised(layer, self.size) for layer in sums]

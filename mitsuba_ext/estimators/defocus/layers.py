@@ -1,5 +1,5 @@
-"""Divides a picture into layers by how much a lens blurs them. Layers are needed because near
-objects hide those behind them from a part of the lens only."""
+"""Divides an image into layers by their blur through a lens. Layers are needed because near objects
+hide the objects behind them from only a part of the lens."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 
 from .images import Size, filled
 
-#: Surfaces that are blurred by less than this, in pixels, are in focus.
+#: The maximum blur of surfaces in focus, in pixels.
 IN_FOCUS = 1.0
 
-#: Two layers overlap, so that a surface that crosses the limit between them has no gap: both have
-#: surfaces blurred by up to this much more than the limit (relative to it, and at least in pixels).
-_OVERLAP, _LEAST_OVERLAP = 0.25, 1.0
+#: The overlap of two layers at their limit, relative to the limit, and its minimum in pixels. Both
+#: layers contain the surfaces in the overlap, so that a surface that crosses the limit has no gap.
+_OVERLAP, _MIN_OVERLAP = 0.25, 1.0
 
-#: Surfaces on one side of the focus are divided into two layers if the blur of the more blurred
-#: part is at least this many times that of the other.
+#: The minimum ratio between the blurs of two parts of the surfaces on one side of the focus for
+#: dividing them into two layers.
 _SPLIT_RATIO = 1.5
 
 
@@ -30,12 +30,12 @@ class Layer:
     """One layer.
 
     Attributes:
-        color: Four numbers for each pixel: RGB times coverage, and coverage (the share of the
+        color: Four numbers for each pixel: RGB times coverage, and coverage (the fraction of the
             pixel's area that the layer fills).
         blur: Signed radius of the circle of confusion in pixels (:meth:`ThinLens.blur`). Beyond the
-            layer's edges, that of the nearest pixels.
-        glow: The same radius as a mean of samples weighted by their brightness. ``None`` if not
-            known.
+            layer's edges, the radius at the nearest pixels.
+        glow: The same radius as a mean of samples weighted by their brightness; ``None`` if
+            unknown.
         shared: Surfaces with a larger blur are in the layer before as well.
     """
 
@@ -50,7 +50,7 @@ class Limits:
     """The limits between layers.
 
     Attributes:
-        blurs: Signed radii in pixels, the largest first; one fewer than layers.
+        blurs: Signed radii in pixels, largest first; one fewer than there are layers.
     """
 
     blurs: list[float]
@@ -60,26 +60,26 @@ class Limits:
         return len(self.blurs) + 1
 
     def contains(self, layer: int, blur: mi.Float) -> mi.Bool:
-        """Does the layer with this index contain a surface of this blur? Layers overlap."""
+        """Whether the layer with this index contains a surface with this blur. Layers overlap."""
         inside = mi.Bool(True)
         if layer > 0:
             limit = self.blurs[layer - 1]
-            inside &= blur <= limit + max(_LEAST_OVERLAP, _OVERLAP * abs(limit))
+            inside &= blur <= limit + max(_MIN_OVERLAP, _OVERLAP * abs(limit))
         if layer < len(self.blurs):
             inside &= blur > self.blurs[layer]
         return inside
 
     def shared(self, layer: int) -> float:
-        """See :attr:`Layer.shared`, for the layer with this index."""
+        """The value of :attr:`Layer.shared` for the layer with this index."""
         return self.blurs[layer - 1] if layer > 0 else math.inf
 
     def is_before(self, layer: int, blur: mi.Float) -> mi.Bool:
-        """Is the layer in front of a surface of this blur, or does it contain it? If so, a ray that
-        reaches the surface shows whether the layer covers it."""
+        """Whether the layer is in front of a surface with this blur or contains it. If so, a ray
+        that reaches the surface shows whether the layer covers it."""
         inside = mi.Bool(True)
         if layer > 0:
             limit = self.blurs[layer - 1]
-            inside &= blur <= limit + max(_LEAST_OVERLAP, _OVERLAP * abs(limit))
+            inside &= blur <= limit + max(_MIN_OVERLAP, _OVERLAP * abs(limit))
         return inside
 
 
@@ -99,9 +99,9 @@ def limits_of(blurs: np.ndarray) -> Limits:
 
 
 def split(blurs: np.ndarray) -> list[float]:
-    """The limit that divides positive blurs into two classes with the least variance within them
-    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none if the classes
-    are similar."""
+    """The limit that divides positive blurs into two classes with the smallest variance within them
+    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none if the classes are
+    similar."""
     if blurs.max() < _SPLIT_RATIO * blurs.min():
         return []
     counts, edges = np.histogram(blurs.astype(np.float64), 256)
@@ -115,7 +115,7 @@ def split(blurs: np.ndarray) -> list[float]:
     best = int(between.argmax())
     if between[best] <= 0 or mean_above[best] < _SPLIT_RATIO * mean_below[best]:
         return []
-    # Take the middle of a gap in the histogram, as all limits within the gap are equally good
+    # Take the middle of a gap in the histogram, because all limits within the gap are equally good
     last = best
     while counts[last + 1] == 0:
         last += 1
@@ -124,18 +124,18 @@ def split(blurs: np.ndarray) -> list[float]:
 
 @dataclass
 class LayerSums:
-    """Sums over the samples of each pixel, for one layer.
+    """Sums over each pixel's samples, for one layer.
 
     Attributes:
-        color: RGB of the samples that hit the layer.
-        blur: Their blurs.
-        hits: Their number.
-        known: The number of samples that show whether the layer is there: those that hit something
+        color: The RGB of the samples that hit the layer.
+        blur: The blurs of these samples.
+        hits: The number of these samples.
+        known: The number of samples that show whether the layer is there: those that hit a surface
             in it or behind it.
-        guides: For a denoiser: sums of RGB of the albedo, and of the shading normal; and how many
-            of the hits were lights. Empty if there is no denoiser.
-        glow: The blurs times the brightness of the samples, and this brightness; ``None`` if they
-            are not needed.
+        guides: For a denoiser: sums of the albedo's RGB and of the shading normal, and the number
+            of hits on lights. Empty if there is no denoiser.
+        glow: The sums of the blurs times the brightness of the samples, and of this brightness;
+            ``None`` if not needed.
         shared: Surfaces with a larger blur are in the layer before as well.
     """
 
@@ -149,13 +149,13 @@ class LayerSums:
 
     @property
     def is_there(self) -> bool:
-        """Did any sample hit the layer?"""
+        """Whether any sample hit the layer."""
         return bool((self.hits > 0).numpy().any())
 
 
 def layers_from_sums(sums: Sequence[LayerSums], size: Size) -> list[Layer]:
-    """Layers, the nearest first; empty ones are left out. The last one covers all pixels: where no
-    sample has hit it, it is filled with the colours around."""
+    """Layers, nearest first, without empty ones. The last layer covers all pixels: where no sample
+    has hit it, it is filled with surrounding colours."""
     present = [layer.is_there for layer in sums]
     last = max((i for i, is_there in enumerate(present) if is_there), default=0)
     return [
@@ -166,7 +166,7 @@ def layers_from_sums(sums: Sequence[LayerSums], size: Size) -> list[Layer]:
 
 
 def _layer(sums: LayerSums, size: Size, is_last: bool) -> Layer:
-    # With film filters that have negative lobes, the sums of a pixel can be negative
+    # With film filters with negative lobes, the sums of a pixel can be negative
     is_known = (sums.known > 1e-6) & (sums.hits > 1e-6 * sums.known)
     scale = dr.select(is_known, dr.rcp(dr.select(is_known, sums.known, 1)), 0)
     coverage = dr.minimum(sums.hits * scale, 1)
@@ -174,7 +174,7 @@ def _layer(sums: LayerSums, size: Size, is_last: bool) -> Layer:
     scale = dr.select(is_known, coverage / dr.select(is_known, sums.hits, 1), 0)
     color = sums.color * scale
     values = dr.ravel(mi.Vector4f(color.x, color.y, color.z, coverage))
-    # The last layer is filled up to full coverage, as nothing is behind it
+    # The last layer is filled up to full coverage because nothing is behind it
     weight = coverage if is_last else dr.select(sums.known > 1e-6, mi.Float(1), 0)
     blurs = sums.blur * scale
     dr.eval(values, weight, blurs, coverage)
@@ -188,7 +188,7 @@ def _layer(sums: LayerSums, size: Size, is_last: bool) -> Layer:
 
 
 def sums_of_picture(color: mi.Color3f, blur: mi.Float, limits: Limits) -> list[LayerSums]:
-    """The sums of a picture of which only the first surface is known.
+    """The sums of an image for which only the first surfaces are known.
 
     Parameters:
         color: The colour of each pixel, row by row.

@@ -1,4 +1,4 @@
-"""The picture that a lens makes of layers, with the visibility computed for each point of the lens.
+"""The image of layers through a lens, with visibility computed for each point of the lens.
 """
 
 from __future__ import annotations
@@ -17,43 +17,42 @@ from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
 
-#: Neighbouring pixels rotate the points by different angles, so that the errors of the 48 points
-#: differ from pixel to pixel. These are the ranks of the angles in a square of 4 × 4 pixels (Bayer
-#: matrix).
+#: The ranks of the angles by which the pixels of a 4 × 4 square rotate the points (Bayer matrix),
+#: so that the errors of the 48 points differ between neighbouring pixels.
 _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 
-#: Pairs of a radius and points per ring: if no layer that a pixel sees is blurred by more than the
-#: radius, in pixels, these few points are enough; above the last radius, it is all of ``RINGS``. A
-#: circle that does not leave the pixel needs one point.
+#: Pairs of a radius, in pixels, and the numbers of points per ring that are enough if no layer that
+#: a pixel sees is blurred by more than the radius. Above the last radius, all ``RINGS`` are used. A
+#: circle within the pixel needs one point.
 _FEW_POINTS = ((0.5, (1,)), (2.0, (4, 8)))
 
-#: Most passes that search for highlights.
+#: The maximum number of passes that search for highlights.
 _ROUNDS = 2
 
-#: If the blurs of a layer differ by no more than this, in pixels, they count as equal.
-_FLAT = 0.5
+#: The maximum difference, in pixels, between blurs of a layer that count as equal.
+_EQUAL_BLURS = 0.5
 
-#: From this coverage on, a layer hides what is behind it.
+#: The minimum coverage of a layer that hides everything behind it.
 _OPAQUE = 0.9999
 
-#: How many pixels beyond the circle of its own blur a pixel may see.
+#: The number of pixels that a pixel may see beyond the circle of its own blur.
 _MARGIN = 2.0
 
 
 def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
-    """The picture that a thin lens makes of layers.
+    """The image of layers through a thin lens.
 
-    Each of 48 points of the lens sees each layer shifted. A layer covers those behind it for this
-    point only. Near objects therefore hide a part of the lens from far ones, which become sharper,
-    and shifted. Each pixel has a mask of the visible part of the lens, where the thesis of Guo
-    (``effective.py``) approximates it by a radius and a shift.
+    Each of 48 points of the lens sees each layer shifted. For each point separately, a layer covers
+    the layers behind it. Near objects therefore hide a part of the lens from far ones, which become
+    sharper and shifted. Each pixel has a mask of the visible part of the lens, which Guo's thesis
+    (``effective.py``) approximates by a radius and a shift.
 
     The shifted position is found in two steps: first with the blur at the pixel, then with the
-    layer's blur at the position of the first step.
+    layer's blur at the position from the first step.
 
     Parameters:
-        layers: The layers, the nearest first.
-        size: Size of the pictures.
+        layers: The layers, nearest first.
+        size: The size of the images.
     """
     return _LensFilter(layers, size).picture()
 
@@ -67,7 +66,7 @@ class _LensFilter:
         self._highlights: list[tuple[int, Highlights]] = []
         self._take_highlights()
         dr.eval([layer.blur for layer in layers])
-        self._is_flat = [_range(layer.blur) <= _FLAT for layer in layers]
+        self._is_flat = [_range(layer.blur) <= _EQUAL_BLURS for layer in layers]
 
     def _take_highlights(self) -> None:
         """Moves highlights from the layers to ``_highlights``. Once the brightest ones are gone,
@@ -86,7 +85,7 @@ class _LensFilter:
                 return
 
     def picture(self) -> mi.Color3f:
-        """Computes the picture, together for all pixels that see the same layers through the same
+        """Computes the image, jointly for all pixels that see the same layers through the same
         number of points."""
         index, position = self._size.pixels()
         place = mi.Point2f(position) + 0.5
@@ -124,7 +123,7 @@ class _LensFilter:
         into ``_few``. The last layer can be seen everywhere except behind opaque ones."""
         bits, largest, is_open = mi.UInt32(0), mi.Float(0), mi.Bool(True)
         for k, (layer, pyramid) in enumerate(zip(self._layers, self._pyramids)):
-            # Four pixels of a level that is coarse enough that they cover the circle
+            # Four pixels of a level coarse enough for them to cover the circle
             reach = dr.abs(layer.blur) + _MARGIN
             level = mi.UInt32(dr.ceil(dr.log2(2 * reach)))
             view = pyramid.view(dr.minimum(level, pyramid.level_count - 1))
@@ -149,8 +148,8 @@ class _LensFilter:
 
 @dataclass
 class _LayerView:
-    """A layer as a pixel sees it: the layer's blur at the pixel, its blurs at all pixels (``None``
-    if these are equal), and its colours."""
+    """A layer as seen by a pixel: the layer's blur at the pixel, its blurs at all pixels (``None``
+    if they are equal), and its colours."""
 
     blur: mi.Float
     blurs: mi.Float | None
@@ -158,7 +157,7 @@ class _LayerView:
 
 
 class _Points:
-    """Points of the lens, which pixels rotate by different angles."""
+    """Points of the lens, rotated by different angles in different pixels."""
 
     def __init__(self, rings: tuple[int, ...]) -> None:
         points = ring_points(rings) if sum(rings) > 1 else np.zeros((1, 2))
@@ -167,7 +166,7 @@ class _Points:
         self._step = dr.opaque(mi.Float, 2 * math.pi / math.gcd(*rings) / len(_TURNS))
 
     def turn(self, position: mi.Vector2i) -> mi.Vector2f:
-        """Sine and cosine of the angle by which a pixel rotates the points."""
+        """The sine and cosine of the angle by which a pixel rotates the points."""
         ranks = from_numpy(mi.UInt32, _TURNS)
         rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
         return mi.Vector2f(*dr.sincos(mi.Float(rank) * self._step))
@@ -192,7 +191,7 @@ def _turned(point: mi.Point2f, turn: mi.Vector2f) -> mi.Point2f:
 def _through(
     place: mi.Point2f, point: mi.Point2f, size: Size, seen: list[_LayerView]
 ) -> tuple[mi.Color3f, mi.Float]:
-    """Colour and opacity of all layers, seen from a point of the lens."""
+    """The colour and opacity of all layers, seen from a point of the lens."""
     through, color = mi.Float(1), mi.Color3f(0)
     for layer in seen:
         at = place + layer.blur * point

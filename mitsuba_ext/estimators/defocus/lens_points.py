@@ -1,4 +1,4 @@
-"""Points of the lens, from the middle to the edge."""
+"""Points of the lens, from the centre to the edge."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import numpy as np
 from ...util.arrays import from_numpy
 from .images import LevelView, Pyramid
 
-#: Number of points of each ring, the innermost first. Every point stands for the same area.
+#: The number of points in each ring, innermost first. Every point represents the same area.
 RINGS = (8, 16, 24)
 
 
 def ring_points(rings: tuple[int, ...] = RINGS) -> np.ndarray:
-    """Points of the unit disk: rings around its middle, each in the middle (by area) of an annulus
-    whose area is in proportion to the points on it: [point, 2].
+    """Points of the unit disk, [point, 2]: rings around its centre, each at the middle (by area) of
+    an annulus whose area is proportional to its number of points.
 
-    Their mean is 0. The default of 48 points in three rings is that of J. J. Guo, PhD thesis, TU
-    Delft, section 5.4.1.2.
+    The mean of the points is 0. The default of 48 points in three rings is from J. J. Guo, PhD
+    thesis, TU Delft, section 5.4.1.2.
     """
     ends = np.cumsum([0, *rings]) / sum(rings)
     points = []
     for i, count in enumerate(rings):
         radius = np.sqrt((ends[i] + ends[i + 1]) / 2)
-        # Rotate every second ring, so that points of neighbouring rings are not aligned
+        # Rotates every second ring, so that points of neighbouring rings are not aligned
         angle = 2 * np.pi * (np.arange(count) + 0.5 * (i % 2)) / count
         points.append(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     return np.concatenate(points)
@@ -36,13 +36,13 @@ class LensPoints:
     """A table of points of the unit disk.
 
     Parameters:
-        points: [point, 2]
+        points: The points, [point, 2].
     """
 
     def __init__(self, points: np.ndarray) -> None:
         self._table = from_numpy(mi.Float, points)
         self.count = dr.opaque(mi.UInt32, len(points))
-        # Half of the distance between neighbours, in radii
+        # Half the distance between neighbours, in radii
         self._step = 0.5 * math.sqrt(math.pi / len(points))
 
     def at(self, i: mi.UInt32) -> mi.Point2f:
@@ -50,7 +50,7 @@ class LensPoints:
 
     def view(self, pyramid: Pyramid, radius: mi.Float) -> LevelView:
         """The level of a pyramid whose pixels are half as large as the distance between the points
-        on a disk of this radius, so that little is missed between them."""
+        on a disk of this radius, so that little is missed between the points."""
         level = dr.round(dr.log2(dr.maximum(self._step * dr.abs(radius), 1)))
         return pyramid.view(mi.UInt32(dr.minimum(level, pyramid.level_count - 1)))
 
@@ -61,7 +61,7 @@ def disk_mean(points: LensPoints, view: LevelView, middle: mi.Point2f, radius: m
 
     Parameters:
         view: The level of the image's pyramid to read.
-        middle, radius: Centre (from the corner of the image) and radius, in pixels.
+        middle, radius: The centre (from the corner of the image) and the radius, in pixels.
     """
     i, total = mi.UInt32(0), mi.Vector4f(0)
     while i < points.count:

@@ -1,5 +1,5 @@
-"""Blurs the near layer: a separable filter of its colour, coverage and blur, and of the direction
-towards its objects."""
+"""Blurs the near layer with a separable filter of its colour, coverage and blur, and of the
+direction towards its objects."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import mitsuba as mi
 from .images import Size, bilinear, halved
 from .layers import Layer
 
-#: The most pixels of the window to each side. Larger windows are applied to a copy of the picture
-#: at lower resolution.
-_MOST_TAPS = 12
+#: The maximum number of pixels of the window on each side. Larger windows are applied to a copy of
+#: the image at lower resolution.
+_MAX_TAPS = 12
 
 
 @dataclass
@@ -22,8 +22,8 @@ class NearField:
 
     Attributes:
         color: RGB times opacity, and opacity.
-        blur: The largest radius in the window: that of the nearest object, in pixels.
-        direction: The direction towards the objects in the window: of length 1, or 0 if there are
+        blur: The largest radius in the window, which belongs to the nearest object, in pixels.
+        direction: The direction towards the objects in the window, of length 1; 0 if there are
             none.
     """
 
@@ -33,15 +33,15 @@ class NearField:
 
 
 def near_field(layer: Layer, size: Size, radius: float) -> NearField:
-    """Filters a layer by a Gaussian. ``radius`` is that of the window, in pixels; the standard
-    deviation is a third of it.
+    """Filters a layer with a Gaussian. ``radius`` is the radius of the window, in pixels; the
+    standard deviation is a third of it.
 
     Source: J. J. Guo, PhD thesis, TU Delft, section 5.4.1.1, Listing 1 and Eq. 5.5. Wide windows
-    are filtered in a copy of lower resolution.
+    are filtered in a copy at lower resolution.
     """
     full, color, blur = size, layer.color, layer.blur
     scale = 1
-    while radius / scale > _MOST_TAPS and size.count > 1:
+    while radius / scale > _MAX_TAPS and size.count > 1:
         dr.eval(color, blur)
         smaller = halved(mi.Vector4f, color, size)
         color, blur = dr.ravel(smaller), halved(mi.Float, blur, size)
@@ -62,7 +62,7 @@ def near_field(layer: Layer, size: Size, radius: float) -> NearField:
     place = (mi.Point2f(position) + 0.5) / scale
     color, found = (bilinear(mi.Vector4f, flat, size, place) for flat in (color, around))
     length = dr.sqrt(found.x**2 + found.y**2)
-    # If the coverage is equal on all sides, only rounding errors are left of the direction
+    # If the coverage is equal on all sides, only rounding errors remain of the direction
     is_clear = length > 1e-3 * dr.maximum(found.z, 1e-3)
     direction = mi.Vector2f(found.x, found.y) / dr.select(is_clear, length, 1)
     return NearField(color, found.w, dr.select(is_clear, direction, 0))
@@ -73,8 +73,8 @@ def _pass(axis, position, size, color, around, taps, factor):
     """The filter along an axis.
 
     Parameters:
-        color: RGB times coverage, and coverage. Their result is a Gaussian mean.
-        around: The sums of the offsets of covered pixels in x and y, and of the coverage; and the
+        color: RGB times coverage, and coverage, which are averaged with Gaussian weights.
+        around: The sums of the offsets of covered pixels in x and y and of the coverage, and the
             largest blur. All pixels of the window have the same weight.
     """
     i = -taps

@@ -1,4 +1,4 @@
-"""The first surface along a ray from the middle of a lens, and the surface that it hides."""
+"""The first surface along a ray from the centre of a lens, and the surface that it hides."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ...transport.numbers import Numbers
 from ...util.arrays import channel_mean
 from .thin_lens import ThinLens
 
-#: Surfaces whose null transmission is larger than this are skipped.
-_MOST_TRANSMITTED = 0.5
+#: The null transmission above which surfaces are skipped.
+_MAX_TRANSMITTANCE = 0.5
 
-#: The search for hidden surfaces begins at the depth at which the blur is this fraction of the blur
-#: of the surface in front, or ...
-_BEHIND = 0.5
+#: The search for hidden surfaces begins at the depth where the blur is this fraction of the front
+#: surface's blur, or …
+_BEHIND_FRACTION = 0.5
 
-#: ... at which it is smaller by this number of pixels: the lens sees nothing of surfaces whose blur
+#: … where it is smaller by this number of pixels: the lens sees nothing of surfaces whose blur
 #: differs less.
-_LEAST_STEP = 2.0
+_MIN_STEP = 2.0
 
 
 class LensCentre:
-    """Camera rays from the middle of the aperture (``CameraSamples.aperture``)."""
+    """Camera rays from the centre of the aperture (``CameraSamples.aperture``)."""
 
     def draw(
         self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
@@ -36,14 +36,14 @@ class LensCentre:
 
 @dataclass
 class Surface:
-    """A surface that a ray hits.
+    """A surface hit by a ray.
 
     Attributes:
-        blur: Its signed radius of the circle of confusion in pixels; that of the sky if the ray
-            hits nothing.
-        is_hit: Does the ray hit a surface?
+        blur: The signed radius of its circle of confusion in pixels; the sky's if the ray hits
+            nothing.
+        is_hit: Whether the ray hits a surface.
         shape: The shape that was hit.
-        side: The side of the surface on which the ray arrives: 1 or -1.
+        side: The side of the surface from which the ray arrives: 1 or -1.
         guides: The auxiliary features of a denoiser: RGB of the albedo, the shading normal, and
             whether the surface is a light. Empty if there is no denoiser.
     """
@@ -56,13 +56,13 @@ class Surface:
 
 
 class PinholeView:
-    """The scene, seen from the middle of a lens.
+    """The scene, seen from the centre of a lens.
 
     Parameters:
-        view: Gives the lens' rays and depths.
+        view: The view that provides the lens's rays and depths.
         scene: The scene.
-        lens: Gives the blur at a depth.
-        has_guides: Are the features of a denoiser computed (:attr:`Surface.guides`)?
+        lens: The lens, which gives the blur at a depth.
+        has_guides: Whether to compute the features of a denoiser (:attr:`Surface.guides`).
     """
 
     def __init__(
@@ -79,20 +79,20 @@ class PinholeView:
     def beyond(
         self, ray: mi.Ray3f, first: Surface, active: mi.Bool
     ) -> tuple[mi.Ray3f, Surface, mi.Bool]:
-        """The surface that the ``first`` surface hides, where ``active``.
+        """The surface hidden by the ``first`` surface, in ``active`` lanes.
 
-        The start of the ray is moved behind surfaces of the same object: to the depth at which the
-        blur is half as large. Behind the focus, it is halfway to the blur of the sky.
+        The origin of the ray is moved behind surfaces of the same object, to the depth where the
+        blur is half as large. Behind the focus, it is moved halfway to the blur of the sky.
 
         Returns:
-            The rest of the ray, the surface that it hits, and whether there can be one: there is
-            nothing behind the sky.
+            The rest of the ray, the surface that it hits, and whether there can be one (nothing is
+            behind the sky).
         """
         sky, blur = self._lens.blur_of_sky, first.blur
-        start = dr.select(blur > 0, _BEHIND * blur, blur - _BEHIND * (blur - sky))
-        start = dr.minimum(start, blur - _LEAST_STEP)
+        start = dr.select(blur > 0, _BEHIND_FRACTION * blur, blur - _BEHIND_FRACTION * (blur - sky))
+        start = dr.minimum(start, blur - _MIN_STEP)
         active = active & first.is_hit & (start > sky)
-        # The depth that has the blur ``start``
+        # The depth with the blur ``start``
         scale = dr.opaque(mi.Float, self._lens.pixels_per_disparity)
         depth = scale / dr.select(active, start - sky, 1)
         distance = (depth - self._view.depth(ray.o)) / dr.dot(ray.d, self._view.axis)
@@ -101,7 +101,7 @@ class PinholeView:
         rest.o = ray(dr.select(active, distance, 0))
 
         def passes(si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool) -> mi.Bool:
-            """The rest of the ray may leave the object in front."""
+            """Lets the rest of the ray leave the object in front."""
             out = (si.shape == first.shape) & (side != first.side)
             return out | self._lets_through(si, side, active) if self._has_holes else out
 
@@ -129,6 +129,6 @@ class PinholeView:
     def _lets_through(
         si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool
     ) -> mi.Bool:
-        """Is the surface skipped because of its null transmission?"""
+        """Whether the surface is skipped because of its null transmission."""
         through = si.bsdf().eval_null_transmission(si, active & si.is_valid())
-        return channel_mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED
+        return channel_mean(mi.unpolarized_spectrum(through)) > _MAX_TRANSMITTANCE

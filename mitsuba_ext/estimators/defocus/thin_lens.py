@@ -1,4 +1,4 @@
-"""How much a thin lens blurs a point of the scene."""
+"""The blur of scene points through a thin lens."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class ThinLens:
     """A thin lens in front of a film.
 
     Light that reaches the pixel x through the point u of the unit disk (the aperture) crosses the
-    depth z at a point that the middle of the lens sees at the position x + u · blur(z). A point is
-    therefore blurred to a disk, its circle of confusion, of the radius \\|blur(z)\\|.
+    depth z at a point that the centre of the lens sees at the position x + u · blur(z). A point is
+    therefore blurred to a disk, its circle of confusion, with the radius \\|blur(z)\\|.
 
     Attributes:
-        aperture_radius: Radius of the aperture, in units of the scene.
-        focus_distance: Depth of surfaces in focus, along the axis of the lens; may be infinite.
-        fov: Horizontal field of view of the whole film, in degrees.
-        film_width: Width of the whole film, not of a crop window, in pixels.
+        aperture_radius: The radius of the aperture, in scene units.
+        focus_distance: The depth of surfaces in focus along the lens axis; may be infinite.
+        fov: The horizontal field of view of the whole film, in degrees.
+        film_width: The width of the whole film, not of a crop window, in pixels.
     """
 
     aperture_radius: float
@@ -42,7 +42,7 @@ class ThinLens:
     @property
     def pixels_per_disparity(self) -> float:
         """The distance in pixels between the images of a point at inverse depth 1, seen from the
-        edge and from the middle of the aperture, with the focus at infinity."""
+        edge and from the centre of the aperture, with the focus at infinity."""
         width = 2 * math.tan(math.radians(self.fov) / 2)
         return self.aperture_radius * self.film_width / width
 
@@ -58,7 +58,7 @@ class ThinLens:
         Parameters:
             depth: Depth along the axis of the lens, positive; may be infinite.
         """
-        # The reciprocal of infinity is not 0 in all backends
+        # The reciprocal of infinity is not 0 in every backend
         return self.blur_at(dr.select(dr.isfinite(depth), dr.rcp(depth), 0))
 
     def blur_at(self, inverse_depth: mi.Float) -> mi.Float:

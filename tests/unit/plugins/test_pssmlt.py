@@ -301,12 +301,12 @@ def test_a_warning_tells_that_a_chain_stayed(monkeypatch: pytest.MonkeyPatch) ->
     """By its visits, in units of those of a pixel."""
     told: list[str] = []
     monkeypatch.setattr(mi, "Log", lambda level, text: told.append(text))
-    monkeypatch.setattr(visits, "_LONG", 1)
-    monkeypatch.setattr(visits, "_STAY", 0.01)
+    monkeypatch.setattr(visits, "_LONG_STAY", 1)
+    monkeypatch.setattr(visits, "_LONG_STAY_FRACTION", 0.01)
     batches(mi.load_dict(stage()), pssmlt(**_FOUR_PER_PIXEL, p_large=0.5), 64, [1])
     assert any("stayed at one path" in text for text in told)
     told.clear()
-    monkeypatch.setattr(visits, "_STAY", 1e6)
+    monkeypatch.setattr(visits, "_LONG_STAY_FRACTION", 1e6)
     batches(mi.load_dict(stage()), pssmlt(**_FOUR_PER_PIXEL, p_large=0.5), 64, [1])
     assert not any("stayed at one path" in text for text in told)
 

@@ -1,4 +1,4 @@
-"""The density with which bidirectional path tracing makes a part of a path."""
+"""The density with which bidirectional path tracing makes part of a path."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .space import PathSpace
 from .techniques import Techniques
 
 #: Stands for the logarithm of 0.
-_NONE = -1e30
+_LOG_ZERO = -1e30
 
 
 @dr.syntax
@@ -23,8 +23,8 @@ def log_density(
     active: mi.Bool,
     techniques: Techniques | None = None,
 ) -> mi.Float:
-    """The logarithm of the density, summed over all techniques, with which the vertices between
-    ``keeps`` and ``rest`` are made.
+    """The logarithm of the density of making the vertices between ``keeps`` and ``rest``, summed
+    over all techniques.
 
     Parameters:
         keeps, rest: As in :class:`~mitsuba_ext.estimators.chains.path_space.plan.Plan`.
@@ -38,28 +38,28 @@ def log_density(
     others, impossible = mi.Float(0), mi.Int32(0)
     while active & (index < rest):
         x = _from_light(memory, path, index)
-        is_none = x < _NONE
+        is_none = x < _LOG_ZERO
         others += dr.select(is_none, 0, x)
         impossible += dr.select(is_none, 1, 0)
         index += 1
 
     # ----- One more vertex at a time made from the camera instead -----
     index = keeps + 1
-    largest, total = mi.Float(_NONE), mi.Float(0)
+    largest, total = mi.Float(_LOG_ZERO), mi.Float(0)
     while active & (index <= rest):
         joins = _joins(space, memory, path, index, can_be_hit)
         chance = mi.Float(uniform)
         if dr.hint(techniques is not None, mode="scalar"):
             chance = techniques.log_chance(path.length, index - 1, active)
-        x = dr.select(joins & (impossible == 0), others + chance, _NONE)
+        x = dr.select(joins & (impossible == 0), others + chance, _LOG_ZERO)
         larger = dr.maximum(largest, x)
-        total = total * dr.exp(largest - larger) + dr.select(x > _NONE, dr.exp(x - larger), 0)
+        total = total * dr.exp(largest - larger) + dr.select(x > _LOG_ZERO, dr.exp(x - larger), 0)
         largest = larger
         lost = _from_light(memory, path, index)
         gained = memory.logs[path.at + index].from_camera
         gained += dr.select(index > 1, memory.logs[path.at + index - 1].to_light, 0)
-        others += dr.select(gained < _NONE, 0, gained) - dr.select(lost < _NONE, 0, lost)
-        impossible += dr.select(gained < _NONE, 1, 0) - dr.select(lost < _NONE, 1, 0)
+        others += dr.select(gained < _LOG_ZERO, 0, gained) - dr.select(lost < _LOG_ZERO, 0, lost)
+        impossible += dr.select(gained < _LOG_ZERO, 1, 0) - dr.select(lost < _LOG_ZERO, 1, 0)
         index += 1
     return largest + dr.log(total)
 
@@ -71,8 +71,8 @@ def _from_light(memory: PathMemory, path: Head, index: mi.UInt32) -> mi.Float:
 
 
 def _joins(space, memory, path, index, can_be_hit) -> mi.Bool:
-    """Can the vertex ``index``, made from the light, be connected to the vertex before it, made
-    from the camera?"""
+    """Whether the vertex ``index``, made from the light, can be connected to the previous vertex,
+    made from the camera."""
     sees = mi.Bool(space.connectable is not None) & (path.length > 1)
     before = dr.select(index == 1, sees, memory.places[path.at + index - 1].is_discrete == 0)
     here = (index == path.length) | (memory.places[path.at + index].is_discrete == 0)
@@ -87,9 +87,9 @@ def log_factors(
     from_light: mi.Bool,
     active: mi.Bool,
 ) -> mi.Float:
-    """The sum of the logarithms of the geometric factors from the first vertex to ``last``: for
-    directions from the camera, or for those from the light. Apart from these factors, a
-    perturbation and its reverse have the same density."""
+    """The sum of the logarithms of the geometric factors from the first vertex to ``last``, for
+    directions from the camera or from the light. Apart from these factors, a perturbation and its
+    reverse have the same density."""
     index, total = mi.UInt32(1), mi.Float(0)
     while active & (index <= last):
         logs = memory.logs[path.at + index]

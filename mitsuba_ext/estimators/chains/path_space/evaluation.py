@@ -1,4 +1,4 @@
-"""Tracing a path from the camera: its contribution, and the densities of the techniques that make
+"""Traces a path from the camera, for its contribution and the densities of the techniques that make
 it."""
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from .space import PathSpace, towards, turned
 #: The light index of a surface that does not emit.
 NO_LIGHT = 0xFFFFFFFF
 
-#: Largest squared difference between the direction of a delta lobe and the direction to the next
-#: vertex. A larger one shows that the path took another lobe. The difference is not 0, since rays
-#: start at an offset from the surface: the direction to a near vertex is not exactly the mirror
-#: direction.
-_MISS = 0.1
+#: The maximum squared difference between the direction of a delta lobe and the direction to the
+#: next vertex. A larger one means that the path took another lobe. The difference is not 0 because
+#: rays start at an offset from the surface, so the direction to a near vertex is not exactly the
+#: mirror direction.
+_MAX_MISS = 0.1
 
 
 @dataclass
@@ -34,11 +34,11 @@ class Evaluation:
     """The contribution of a path.
 
     Attributes:
-        position: Position on the film, in pixels.
+        position: The position on the film, in pixels.
         value: The integrand without geometric factors, as a colour.
         log_geometry: The logarithm of the geometric factors.
-        scatter, shadow: Number of rays traced between vertices, and of shadow rays.
-        active: Paths whose contribution is valid.
+        scatter, shadow: The number of rays traced between vertices, and of shadow rays.
+        active: The lanes with a valid contribution.
     """
 
     position: mi.Point2f
@@ -63,8 +63,8 @@ def trace_from_camera(
     already in memory.
 
     Returns:
-        The memory, with the vertices and their densities; the new path with its light, which may
-        have been found here; the random numbers; and the contribution of the path.
+        The memory, with the vertices and their densities; the new path with its light, which
+        tracing may have found; the random numbers; and the contribution of the path.
     """
     scene, query, kinds, emission = space.scene, space.query, space.kinds, space.emission
     ctx = space.heroes.context()
@@ -81,16 +81,17 @@ def trace_from_camera(
     value = mi.Spectrum(rays.importance)
     hero_is_alone = space.heroes.begin()
     emitter = mi.UInt32(new.emitter)
-    # A lane for each path, since local memory is written at this index
+    # One lane for each path, because local memory is written at this index
     index = dr.full(mi.UInt32, 1, dr.width(new.film))
     geometry = mi.Float(0)
-    # For the previous vertex: its densities so far, and the cosine of the direction that leaves it
+    # The densities so far of the previous vertex, and the cosine of the direction that leaves it
     before, cosine = _no_logs(), mi.Float(1)
     p_before = mi.Point3f(origin)
     light_weight = mi.Spectrum(1)
     scatter, shadow = mi.UInt32(0), mi.UInt32(0)
     is_found = mi.Bool(False)
-    # Has the path only passed through null surfaces? If lights are hidden, it does not see the sky
+    # Whether the path has passed only through null surfaces. If lights are hidden, it then does not
+    # see the sky
     is_straight = mi.Bool(True)
     while dr.hint(active, label="path"):
         si = query.interaction(pi, ray)
@@ -98,7 +99,7 @@ def trace_from_camera(
         is_end = index == length
         is_new = (index > plan.keeps) & (index <= plan.grown)
 
-        # ----- Is this the stored vertex of the path? -----
+        # ----- The stored vertex of the path? -----
         light = _light(space, si, active & is_end)
         emitter = dr.select(is_end & is_new & (light != NO_LIGHT), light, emitter)
         unhittable = kinds.is_unhittable(emitter, is_end)
@@ -180,7 +181,7 @@ def trace_from_camera(
         # ----- The BSDF and its densities -----
         smooth, pdf = eval_bsdf(bsdf, ctx, si, wo, goes_on & ~is_discrete)
         reverse = reverse_density(ctx, bsdf, si, wo, goes_on & ~is_discrete)
-        agrees = is_sampled_discrete & (dr.squared_norm(bs.wo - wo) < _MISS)
+        agrees = is_sampled_discrete & (dr.squared_norm(bs.wo - wo) < _MAX_MISS)
         goes_on &= ~is_discrete | agrees
         if dr.hint(space.hides_emitters, mode="scalar"):
             is_straight &= is_discrete & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -241,16 +242,17 @@ def _no_logs() -> Logs:
 
 
 def _light(space: PathSpace, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-    """The index of the light that a ray has hit."""
+    """The index of the light hit by a ray."""
     emitter = si.emitter(space.scene, active)
     index = space.emission.index(emitter, active)
     return dr.select(emitter != None, index, NO_LIGHT)  # noqa: E711
 
 
 def _lobe_ratio(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
-    """The logarithm of the ratio of solid angles behind and before a delta lobe: the factor of a
-    density of directions for the reverse direction through the lobe. It is 0 except for refraction,
-    where ``η² cos θ dω`` is the same on both sides. The lobe may have a normal of its own."""
+    """The logarithm of the ratio of solid angles behind and before a delta lobe: the factor by
+    which a density of directions changes for the reverse direction through the lobe. It is 0 except
+    for refraction, where ``η² cos θ dω`` is the same on both sides. The lobe may have a separate
+    normal."""
     refracts = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
     n = si.wi + bs.eta * bs.wo
     ratio = dr.abs(dr.dot(n, si.wi)) / (dr.abs(dr.dot(n, bs.wo)) * dr.square(bs.eta))

@@ -1,4 +1,4 @@
-"""The part of a proposal that is made from the light."""
+"""Makes the part of a proposal that starts at the light."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from .memory import Head, PathMemory, Place
 from .plan import Plan
 from .space import PathSpace, turned
 
-#: Smallest and largest angle, in radians, by which perturbations turn directions. For light from
-#: infinity: smallest and largest displacement of the ray, in units of the scene's radius.
+#: The minimum and the maximum angle, in radians, by which perturbations turn directions. For light
+#: from infinity: the minimum and the maximum displacement of the ray, in units of the scene's
+#: radius.
 LOW, HIGH = 1e-4, 0.1
 
 
@@ -30,7 +31,7 @@ def grow_from_light(
     """Makes the vertices from ``plan.rest`` − 1 down to ``plan.grown`` + 1.
 
     Parameters:
-        memory: Holds the old path, and the kept vertices of the new one.
+        memory: The memory, with the old path and the kept vertices of the new path.
         ray: Any camera ray of the new path, for its time and wavelengths.
 
     Returns:
@@ -50,7 +51,7 @@ def grow_from_light(
     ctx.mode = mi.TransportMode.Importance
     last = plan.grown + 1
     active &= is_sound
-    # The vertex on the light may be the only one that is made
+    # The vertex on the light may be the only one to make
     is_done = active & (index < last)
     active &= ~is_done
     while dr.hint(active, label="light subpath"):
@@ -73,7 +74,7 @@ def grow_from_light(
         turns = plan.perturbs & is_kept
         before = memory.places[old.at + index - 1]
         d = dr.select(turns, turned(dr.normalize(before.p - place.p), sample, LOW, HIGH), d)
-        # Between its first and its last vertex, a perturbation only passes through delta lobes
+        # Between its first and its last vertex, a perturbation passes only through delta lobes
         goes_on = ~is_last & (turns | (scatters & (~plan.perturbs | is_discrete)))
 
         # ----- Store the vertex -----
@@ -90,8 +91,8 @@ def grow_from_light(
 
 def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     """The first ray of the walk: from a sampled point on a light, or a ray that hits the kept
-    vertex at which the walk starts. Returns it with the index of the vertex that it leads to, the
-    emitter, the lanes that have such a ray, and the memory."""
+    vertex at which the walk starts. Returns the ray with the index of the vertex to which it leads,
+    the emitter, the lanes with such a ray, and the memory."""
     emitted = space.emission.sample(numbers, ray.time, ray.wavelengths, begins)
     kinds = space.kinds
     is_infinite = kinds.is_infinite(emitted.index, begins)
@@ -100,7 +101,7 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     memory.places.write(end, new.at + new.length, begins)
     is_sound = begins & (dr.max(emitted.weight) > 0)
 
-    # ----- Back to a vertex that is kept -----
+    # ----- Back to a kept vertex -----
     kept = active & ~begins
     place = memory.places[new.at + plan.rest]
     ahead, behind = plan.rest + 1, plan.rest - 1
@@ -114,12 +115,12 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     o, d = place.p + way, -dr.normalize(way)
     index = dr.select(begins, new.length - 1, plan.rest)
 
-    # ----- Perturb the direction at a light without surface -----
+    # ----- Perturb the direction at a light without a surface -----
     leaves = kept & is_end & (beyond | kinds.is_point(new.emitter, kept))
     sample = numbers.next_2d()
     aim = dr.normalize(neighbour.p - place.p)
     aside = _aside(place.p, sample) * space.radius
-    # As far away as emitted rays of lights at infinity begin
+    # At the distance where rays emitted by lights at infinity begin
     far = neighbour.p + aside + place.p * (2 * space.radius)
     o = dr.select(leaves, dr.select(beyond, far, place.p), o)
     aimed = dr.select(beyond, -place.p, turned(aim, sample, LOW, HIGH))

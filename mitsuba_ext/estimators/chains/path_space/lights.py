@@ -14,14 +14,14 @@ _POINT, _FIXED_DIRECTION, _INFINITE, _SURFACE = 1, 2, 4, 8
 
 
 class LightKinds:
-    """The kind of each light of a scene. The attribute is a Python boolean: kernels can leave out
-    the code for lights that do not occur.
+    """The kind of each light of a scene. The attribute is a Python Boolean, so that kernels can
+    omit code for lights that do not occur.
 
     Parameters:
         scene: A scene with lights.
 
     Attributes:
-        has_unhittable: Is there a light that no ray can hit?
+        has_unhittable: Whether there is a light that no ray can hit.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -35,7 +35,7 @@ class LightKinds:
         return dr.gather(mi.EmitterPtr, self._emitters, index, active)
 
     def is_unhittable(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Is it a light that no ray can hit: a point, or a light that shines in one direction?"""
+        """Whether no ray can hit the light: a point, or a light that shines in one direction."""
         return self._has(_POINT | _FIXED_DIRECTION, index, active)
 
     def is_infinite(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
@@ -45,7 +45,7 @@ class LightKinds:
         return self._has(_POINT, index, active)
 
     def is_beam(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Is it a surface that shines in one direction?"""
+        """Whether the light is a surface that shines in one direction."""
         mark = dr.gather(mi.UInt32, self._kinds, index, active)
         return (mark & (_SURFACE | _FIXED_DIRECTION)) == _SURFACE | _FIXED_DIRECTION
 
@@ -80,20 +80,21 @@ def light_start_densities(
 
     Parameters:
         d: The direction of emission.
-        n: Normal of the light.
+        n: The normal of the light.
         ref: The vertex before the light.
 
     Returns:
         The density of the last vertex (see :class:`Logs`), and the factor that emission contributes
-        to the density of the vertex before it: the density of the direction, or for lights at
-        infinity and beams that of the position.
+        to the density of the previous vertex: the density of the direction or, for lights at
+        infinity and beams, the density of the position.
     """
     emitter = kinds.emitter(index, active)
     position, direction = emission.densities(
         scene, emitter, d, n, ref, active, knows_normal=True
     )
     chance = emission.chance(index, active)
-    # For beams and lights at infinity, the density of the last vertex is that of the direction
+    # For beams and lights at infinity, the density of the last vertex is the density of the
+    # direction
     by_direction = kinds.is_infinite(index, active) | kinds.is_beam(index, active)
     return (
         dr.select(by_direction, chance * direction, position),

@@ -16,11 +16,11 @@ class Place:
         p: The point; for a light at infinity, the direction towards it.
         lobe: The random number, in [0, 1), that chooses the lobe of the BSDF. It matters only for
             delta lobes.
-        is_discrete: Does a delta lobe scatter the path: a mirror, smooth glass, or a hole of a
-            mask? 0 or 1.
+        is_discrete: Whether a delta lobe scatters the path (a mirror, smooth glass, or a hole of a
+            mask): 0 or 1.
         d: The direction of the ray from here to the next vertex, on the way from the camera. It is
-            stored, since rays start at an offset from the surface: for vertices close to each other
-            it does not follow from their positions.
+            stored because rays start at an offset from the surface: for vertices that are close
+            together, it does not follow from their positions.
     """
 
     p: mi.Point3f
@@ -33,18 +33,18 @@ class Place:
 class Logs:
     """Natural logarithms of densities at a vertex; −∞ for 0.
 
-    The density of a vertex per area (of a light at infinity: per solid angle) is that of a
-    direction at its neighbour, times a geometric factor. If the direction was chosen by a delta
-    lobe, the density of the direction counts as 1, and the geometric factor is such that both ways
-    through the lobe agree.
+    The density of a vertex per area (for a light at infinity: per solid angle) is the density of a
+    direction at its neighbour times a geometric factor. If a delta lobe chose the direction, the
+    density of the direction counts as 1, and the geometric factor is such that both ways through
+    the lobe agree.
 
     Attributes:
         from_camera, from_light: The geometric factors, for the neighbours on either side. At the
             first vertex, ``from_camera`` is the density of a uniform position on the film; at the
-            last one, ``from_light`` is the density with which light paths begin there.
+            last vertex, ``from_light`` is the density with which light paths begin there.
         to_light, to_camera: The densities per solid angle of the directions to the neighbours. At
             the last vertex, ``to_camera`` is the factor that emission contributes to the density of
-            the vertex before it.
+            the previous vertex.
     """
 
     from_camera: mi.Float
@@ -55,8 +55,8 @@ class Logs:
 
 @dataclass
 class PathMemory:
-    """Memory of two paths in each lane, the state of a chain and its proposal. The vertices of a
-    path are numbered from 1, at the camera, and lie at consecutive places from ``at`` on.
+    """Memory for two paths in each lane, the state of a chain and its proposal. The vertices of a
+    path are numbered from 1, at the camera, and lie at consecutive places starting at ``at``.
 
     Attributes:
         places, logs: The vertices.
@@ -76,19 +76,19 @@ class PathMemory:
 
 
 def stride(most: int) -> int:
-    """Distance between the two paths in memory, for paths of at most ``most`` vertices. Some places
-    before the first vertex and after the last one are read too, without effect."""
+    """The distance between the two paths in memory, for paths of at most ``most`` vertices. Some
+    places before the first vertex and after the last one are also read, without effect."""
     return most + 3
 
 
 @dataclass
 class Head:
-    """The data of a path besides its vertices.
+    """The data of a path except its vertices.
 
     Attributes:
-        at: Where its vertices begin in the memory of the lane.
-        length: Number of segments, which is the number of vertices without the camera.
-        film: Position on the film: in [0, 1)² over the crop window.
+        at: The place where its vertices begin in the memory of the lane.
+        length: The number of segments, which is the number of vertices without the camera.
+        film: The position on the film, in [0, 1)² over the crop window.
         aperture, time, wavelength: The other random numbers of the camera ray.
         emitter: The index of its light in ``scene.emitters()``.
     """

@@ -16,30 +16,30 @@ from .plan import Plan
 from .space import PathSpace
 from .techniques import Techniques
 
-#: Kinds of mutations.
+#: The kinds of mutations.
 NEW_PATH, BIDIRECTIONAL, FROM_CAMERA, FROM_LIGHT = 0, 1, 2, 3
 
-#: Distances on the film by which perturbations move paths: the smallest in pixels, and the largest
-#: in units of the film's width.
-_PIXELS, _WIDTH = 0.1, 0.1
+#: The distances on the film by which perturbations move paths: the minimum in pixels, and the
+#: maximum in units of the film's width.
+_MIN_PIXELS, _MAX_WIDTHS = 0.1, 0.1
 
-#: Multiples of these, modulo one, are a low-discrepancy sequence in the unit square (M. Roberts,
-#: 2018).
-_EVENLY = (0.7548776662466927, 0.5698402909980532)
+#: Numbers whose multiples, modulo one, form a low-discrepancy sequence in the unit square (M.
+#: Roberts, 2018).
+_LATTICE = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True)
 class Switches:
-    """The mutations that are used, besides new paths. A vertex is *discrete* if a delta lobe of its
-    BSDF scatters the path (:attr:`Place.is_discrete`).
+    """The mutations in use, besides new paths. A vertex is *discrete* if a delta lobe of its BSDF
+    scatters the path (:attr:`Place.is_discrete`).
 
     Attributes:
-        bidirectional: Replace a part of a path by a bidirectional random walk.
-        lens: Move the position on the film, and trace the path from there up to its first two
-            consecutive vertices that are not discrete.
-        multi_chain: The same for paths on which directions at other vertices must change too.
-        caustic: Change the direction at the light, or at the second vertex from the camera that is
-            not discrete, and trace the path from there to the camera.
+        bidirectional: Whether to replace part of a path by a bidirectional random walk.
+        lens: Whether to move the position on the film, and trace the path from there to its first
+            two consecutive vertices that are not discrete.
+        multi_chain: The same for paths on which directions at other vertices must also change.
+        caustic: Whether to change the direction at the light, or at the second vertex from the
+            camera that is not discrete, and trace the path from there to the camera.
     """
 
     bidirectional: bool = True
@@ -56,7 +56,7 @@ class Proposal:
         head: The path; its vertices are in memory.
         found: Its contribution.
         log_density: The logarithm of its density as a new path.
-        log_ratio: The logarithm of density of the reverse mutation / density of this mutation.
+        log_ratio: The logarithm of the ratio of the reverse mutation's density to this mutation's.
         technique: The index of the technique that makes a new path.
     """
 
@@ -67,7 +67,7 @@ class Proposal:
     technique: mi.UInt32
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat one that a loop uses as part of the loop's state
 class Mutations:
     """Makes new paths, and paths from other paths.
 
@@ -76,12 +76,12 @@ class Mutations:
 
     Parameters:
         space: The paths of the scene.
-        switches: The mutations that are used.
+        switches: The mutations in use.
     """
 
     def __init__(self, space: PathSpace, switches: Switches) -> None:
         self.space, self._switches = space, switches
-        # Perturbations are proposed more often, since they are accepted more often
+        # Perturbations are proposed more often because they are accepted more often
         self.kinds = [
             kind for kind, shares in (
                 (BIDIRECTIONAL, 1 if switches.bidirectional else 0),
@@ -97,8 +97,7 @@ class Mutations:
     def new_path(
         self, memory: PathMemory, at: mi.UInt32, numbers: Numbers, active: mi.Bool
     ) -> tuple[PathMemory, Numbers, Proposal]:
-        """Makes a new path, independent of others. The first two numbers are its position on the
-        film."""
+        """Makes a new, independent path. The first two numbers are its position on the film."""
         film = numbers.next_2d()
         technique, head, plan = self._fresh(at, film, numbers)
         memory, numbers, head, found = self._make(memory, head, head, plan, numbers, active)
@@ -108,7 +107,7 @@ class Mutations:
     def _fresh(
         self, at: mi.UInt32, film: mi.Point2f, numbers: Numbers
     ) -> tuple[mi.UInt32, Head, Plan]:
-        """Chooses the technique and the camera numbers of a new path; it has no vertices yet."""
+        """Chooses the technique and the camera numbers of a new path, which has no vertices yet."""
         technique, length, grown = self.techniques.choose(numbers.next_1d())
         aperture, time, wavelength = numbers.next_2d(), numbers.next_1d(), numbers.next_1d()
         head = Head(at, length, film, aperture, time, wavelength, dr.zeros(mi.UInt32, 1))
@@ -134,9 +133,9 @@ class Mutations:
 
         Parameters:
             density: :attr:`Proposal.log_density` of ``path``.
-            kind: The kind of mutation that is requested. A path that does not allow this kind gets
-                another one (:meth:`_possible`).
-            film: Film position of a new path, if its first vertex is made from the camera.
+            kind: The requested kind of mutation. A path that does not allow this kind gets another
+                one (:meth:`_possible`).
+            film: The film position of a new path if its first vertex is made from the camera.
         """
         space = self.space
         technique, fresh, plan = self._fresh(stride(space.most) - path.at, film, numbers)
@@ -175,7 +174,7 @@ class Mutations:
         memory = _copy(memory, path, head, active & ~is_new)
         memory, numbers, head, found = self._make(memory, path, head, plan, numbers, active)
 
-        # ----- The densities of this mutation and of the reverse one -----
+        # ----- The densities of this mutation and of the reverse mutation -----
         found_density = self._density(memory, head, found.active)
         ratio = density - found_density
         if BIDIRECTIONAL in self.kinds:
@@ -196,8 +195,8 @@ class Mutations:
         return memory, numbers, Proposal(head, found, found_density, ratio, technique)
 
     def kind(self, sample: mi.Float, new_path: mi.Float) -> mi.UInt32:
-        """The kind of mutation that ``sample`` chooses, with the probability ``new_path`` of new
-        paths, and equal ones of all others in ``kinds``."""
+        """The kind of mutation that ``sample`` chooses, with probability ``new_path`` for new
+        paths, and equal probabilities for all others in ``kinds``."""
         if not self.kinds:
             return mi.UInt32(NEW_PATH)
         x = dr.maximum(sample - new_path, 0) / dr.maximum(1 - new_path, 1e-6) * len(self.kinds)
@@ -211,7 +210,7 @@ class Mutations:
         distributed in each of them."""
         shift = hashed_2d(word, step)
         # Integers: floats would lose the fractional digits of large multiples
-        x, y = (lane * mi.UInt32(round(c * 2**32) & 0xFFFFFFFF) for c in _EVENLY)
+        x, y = (lane * mi.UInt32(round(c * 2**32) & 0xFFFFFFFF) for c in _LATTICE)
         place = mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2.0**-24 + shift
         return dr.minimum(place - dr.floor(place), 1 - 2.0**-24)
 
@@ -221,12 +220,11 @@ class Mutations:
     def _possible(
         self, memory: PathMemory, path: Head, kind: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """The kind of mutation that is made from a path; the last vertex that moves if it is
-        perturbed from the camera; and the first vertex that stays if it is perturbed from the
-        light.
+        """The kind of mutation to make from a path; the last vertex that moves if it is perturbed
+        from the camera; and the first vertex that stays if it is perturbed from the light.
 
         All three depend only on the path's length, and on which of its vertices are discrete. A
-        perturbation changes neither, so that the reverse mutation is of the same kind.
+        perturbation changes neither, so the reverse mutation is of the same kind.
         """
         # The first two consecutive vertices that can be connected
         index, turns, is_open = mi.UInt32(1), mi.UInt32(0), mi.Bool(True)
@@ -262,13 +260,13 @@ class Mutations:
         return made, first, second
 
     def _part(self, path: Head, choice: mi.Point2f, sample: mi.Float) -> Plan:
-        """A random part of a path to replace, which may be the light alone. The part that is kept
-        at the light's end is never the light alone: a walk from the light cannot begin at a given
+        """A random part of a path to replace, which may be only the light. The part kept at the
+        light's end is never only the light, because a walk from the light cannot begin at a given
         point."""
         length = path.length
-        # The last vertex that is kept at the camera's end
+        # The last vertex kept at the camera's end
         keeps = dr.minimum(mi.UInt32(choice.x * mi.Float(length)), length - 1)
-        # The first one that is kept at the light's end: keeps + 2 … length − 1, or none
+        # The first vertex kept at the light's end: keeps + 2 … length − 1, or none
         ends = dr.select(length > keeps + 2, length - keeps - 2, 0) + 1
         rest = keeps + 2 + dr.minimum(mi.UInt32(choice.y * mi.Float(ends)), ends - 1)
         rest = dr.select(rest >= length, length + 1, rest)
@@ -279,8 +277,8 @@ class Mutations:
     def _moved(self, film: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Point2f, mi.Bool]:
         """A position near another one, and whether it is on the film."""
         width = float(self.space.size.x)
-        high = max(_WIDTH * width, 2 * _PIXELS)
-        pixels = _PIXELS * dr.power(high / _PIXELS, sample.x)
+        high = max(_MAX_WIDTHS * width, 2 * _MIN_PIXELS)
+        pixels = _MIN_PIXELS * dr.power(high / _MIN_PIXELS, sample.x)
         y, x = dr.sincos(dr.two_pi * sample.y)
         moved = film + mi.Point2f(x, y) * pixels / self.space.size
         return moved, dr.all((moved >= 0) & (moved < 1))

@@ -1,4 +1,4 @@
-"""The plan of a mutation: which vertices of a path it replaces, and how."""
+"""The plan of a mutation: the vertices of a path that it replaces, and how."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import mitsuba as mi
 
 @dataclass
 class Plan:
-    """How a proposal is made.
+    """The plan of a proposal.
 
     Attributes:
-        keeps: The last vertex that is kept at the camera's end; 0 if none is kept.
-        grown: The last vertex that is made from the camera.
-        rest: The first vertex that is kept at the light's end; length + 1 if none is kept. The
+        keeps: The last vertex kept at the camera's end; 0 if none is kept.
+        grown: The last vertex made from the camera.
+        rest: The first vertex kept at the light's end; length + 1 if none is kept. The
             vertices between ``grown`` and ``rest`` are made from the light.
-        perturbs: Do the new vertices follow the old path at a small distance? Otherwise they are
-            sampled by a random walk. At delta lobes the new path takes the same lobe as the old
-            one.
+        perturbs: Whether the new vertices follow the old path at a small distance. Otherwise, they
+            are sampled by a random walk. At delta lobes, the new path takes the same lobe as the
+            old one.
     """
 
     keeps: mi.UInt32

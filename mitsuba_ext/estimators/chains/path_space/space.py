@@ -1,4 +1,4 @@
-"""The path space of a scene: the data that making and evaluating paths depends on."""
+"""The path space of a scene: the data for making and evaluating paths."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ...light_paths.sensor import ConnectableSensor
 from .lights import LightKinds
 from .memory import Head, Place
 
-#: Largest distance by which a ray may miss a vertex, in units of the shortest segment that ends at
-#: the vertex. A larger one would change the geometric factors of the path.
-_MISS = 0.1
+#: The maximum distance by which a ray may miss a vertex, in units of the shortest segment that ends
+#: at the vertex. A larger one would change the geometric factors of the path.
+_MAX_MISS = 0.1
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat one that a loop uses as part of the loop's state
 class PathSpace:
     """Paths from the camera to a light.
 
     Parameters (and attributes):
-        scene, sensor: The scene and the sensor that are rendered.
-        emission: Samples the rays with which light paths begin.
-        connectable: The sensor as the end of connections; ``None`` if points of the scene cannot
-            be connected to it.
-        query: Intersects rays with the scene.
+        scene, sensor: The rendered scene and the sensor.
+        emission: The sampler of the rays with which light paths begin.
+        connectable: The sensor as an end of connections; ``None`` if scene points cannot be
+            connected to it.
+        query: The query that intersects rays with the scene.
         spp: Samples per pixel of the whole render, for ray differentials.
-        least, most: Lengths of paths, in segments.
-        hides_emitters: Do camera rays pass through area lights, and is the sky invisible?
+        least, most: The minimum and maximum lengths of paths, in segments.
+        hides_emitters: Whether camera rays pass through area lights, and the sky is invisible.
 
     Attributes:
         kinds: The kinds of lights.
         heroes: Hero wavelength sampling for dispersive BSDFs.
-        radius: Approximate radius of the scene.
+        radius: The approximate radius of the scene.
     """
 
     def __init__(
@@ -78,9 +78,9 @@ class PathSpace:
     def on_film(
         self, p: mi.Point3f, ray: mi.Ray3f, head: Head, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """The film position of a point, seen through the path's point of the aperture, as
-        :attr:`Head.film`; and whether the point is seen unless it is occluded. ``ray`` is any
-        camera ray of the path, for its time and wavelengths."""
+        """The film position (as :attr:`Head.film`) of a point seen through the path's aperture
+        point, and whether the point is visible unless occluded. ``ray`` is any camera ray of the
+        path, for its time and wavelengths."""
         if self.connectable is None:
             return mi.Point2f(0), mi.Bool(False)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
@@ -90,26 +90,26 @@ class PathSpace:
         return dr.clip(film, 0, 1 - 2.0**-24), seen.active
 
     def is_same(self, si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
-        """Has a ray hit the vertex at ``p``, up to rounding? A hit on a surface close in front of
-        it does not count: the densities of the path hold for the vertex that was sampled.
+        """Whether a ray has hit the vertex at ``p``, up to rounding. A hit on a surface close in
+        front of it does not count, because the densities of the path apply to the sampled vertex.
 
         Parameters:
             reach: The length of the shortest segment that ends at the vertex.
         """
         exact = self.query.starts.distance(p) + mi.math.RayEpsilon * si.t
-        return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MISS * reach))
+        return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MAX_MISS * reach))
 
 
 def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
-    """The direction from ``p`` to a vertex. The vertex of a light at infinity is a direction
-    itself (``is_direction``)."""
+    """The direction from ``p`` to a vertex. The vertex of a light at infinity is itself a direction
+    (``is_direction``)."""
     return dr.select(is_direction, mi.Vector3f(place.p), dr.normalize(place.p - p))
 
 
 def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
     """A direction at an angle to ``d`` between ``low`` and ``high``. The logarithm of the angle is
-    uniformly distributed. The density depends on the angle alone, so that the reverse perturbation
-    has the same density.
+    uniformly distributed. The density depends only on the angle, so the reverse perturbation has
+    the same density.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3; D. Cline,
     PhD thesis, 2007, Fig. 7.26.

@@ -1,4 +1,5 @@
-"""The techniques that make new paths: the length, and the number of vertices from either end."""
+"""The techniques that make new paths: the path length, and the number of vertices from either
+end."""
 
 from __future__ import annotations
 
@@ -9,22 +10,21 @@ import numpy as np
 from ....util.arrays import from_numpy
 from ....util.discrete_sampling import ONE_MINUS_EPSILON, first_above
 
-#: In the initial distribution, the probability of a path length is that of the length before, times
-#: this.
+#: The ratio between the probabilities of successive path lengths in the initial distribution.
 _DECAY = 0.7
 
-#: The weight of the initial distribution in a learned one. No technique is left out, since some
-#: rarely find light, but then find bright paths.
+#: The weight of the initial distribution in a learned one. No technique is excluded, because some
+#: rarely find light but then find bright paths.
 _FLOOR = 0.3
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat one that a loop uses as part of the loop's state
 class Techniques:
-    """A distribution of techniques. The technique of a path of n segments is the number of its
-    vertices that are made from the camera, 0 to n; the others are made from the light.
+    """A distribution over techniques. The technique of a path with n segments is the number of its
+    vertices made from the camera, 0 to n; the others are made from the light.
 
     Parameters:
-        least, most: Lengths of paths, in segments.
+        least, most: The minimum and maximum lengths of paths, in segments.
     """
 
     def __init__(self, least: int, most: int) -> None:
@@ -37,7 +37,7 @@ class Techniques:
         chance[(self._lengths == 1) & (self._grown == 0)] = 0
         self._first = chance / chance.sum()
         self._tables = [from_numpy(mi.UInt32, a) for a in (self._lengths, self._grown)]
-        # Where the techniques of each length begin
+        # The index of the first technique of each length
         starts = np.concatenate([np.zeros(least), np.cumsum([0, *(lengths + 1)])])[: most + 1]
         self._starts = from_numpy(mi.UInt32, starts)
         self._set(self._first)
@@ -49,15 +49,15 @@ class Techniques:
         dr.eval(self._sums, self._logs)
 
     def kernel_state(self) -> tuple:
-        """The arrays and constants that kernels depend on."""
+        """The arrays and constants on which kernels depend."""
         return (
             self._least, self._most, len(self._first), self._sums, self._logs, self._tables,
             self._starts,
         )  # fmt: skip
 
     def learn(self, index: np.ndarray, target: np.ndarray) -> None:
-        """Learns probabilities that reduce the second moment of the estimate. It is smallest where
-        each technique's part of the second moment, divided by its probability, is the same.
+        """Learns probabilities that reduce the second moment of the estimate. It is minimal if each
+        technique's part of the second moment, divided by its probability, is the same.
 
         Parameters:
             index: The technique of each of many independent paths.

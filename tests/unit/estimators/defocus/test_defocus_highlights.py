@@ -81,7 +81,7 @@ def test_more_highlights_than_are_affordable_keep_their_light(scale, monkeypatch
     bright = scale * np.random.default_rng(1).pareto(1.2, (HEIGHT, WIDTH))
     blurs = np.full((HEIGHT, WIDTH), -12.0)
     images = [picture_of(bright, blurs, [IN_FOCUS])]
-    monkeypatch.setattr(highlights, "_MOST_COVERED", 0.5)
+    monkeypatch.setattr(highlights, "_MAX_COVERED", 0.5)
     images.append(picture_of(bright, blurs, [IN_FOCUS]))
     inner = slice(24, -24)
     for image in images:
