@@ -119,7 +119,7 @@ def scene_options(command: Callable) -> Callable:
         click.option(
             "--plugin", "plugins", multiple=True, metavar="MODULE",
             shell_complete=candidates.modules,
-            help="A Python module, or its .py file, that registers integrators of your own. Can be "
+            help="A Python module, or its .py file, that registers your own integrators. Can be "
             "repeated.",
         ),
         click.option(
@@ -154,7 +154,7 @@ def check_executor(workers: int | None, dask: str | None) -> None:
         click.UsageError: Both options are given.
     """
     if workers is not None and dask is not None:
-        raise click.UsageError("--workers and --dask exclude each other")
+        raise click.UsageError("--workers and --dask cannot be combined")
 
 
 def kernels_compiled() -> int:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
-    help="Equal time: S seconds for each run, learning included, compilation excluded.",
+    help="Equal time: S seconds for each run, including learning but not compilation.",
 )
 @click.option(
     "--sweep", type=Numbers(), metavar="N,N,…",
@@ -135,9 +135,9 @@ def compare(
     if sum(value is not None for value in given.values()) != 1:
         raise click.UsageError(f"give one of {', '.join(given)}")
     if reference and reference_spp:
-        raise click.UsageError("--reference and --reference-spp exclude each other")
+        raise click.UsageError("--reference and --reference-spp cannot be combined")
     if no_reference and (reference or reference_spp or reference_integrator):
-        raise click.UsageError("--no-reference and other options of references exclude each other")
+        raise click.UsageError("--no-reference cannot be combined with options of references")
     check_executor(workers, dask)
     scenes, integrators = _sort_out(names)
     if not plugins:
@@ -193,7 +193,7 @@ def compare(
     for name in ("results.json", "report.html"):
         click.echo(out / name)
     if interrupted:
-        say("interrupted: the results are of the finished runs")
+        say("interrupted: the results cover only the finished runs")
         return INTERRUPTED
     return 1 if any(map(_has_trouble, results["scenes"])) else 0
 

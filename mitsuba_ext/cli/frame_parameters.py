@@ -56,7 +56,7 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
         except Exception as error:  # the function may raise anything too
             raise InputError(f"{text}: frame {frame}: {type(error).__name__}: {error}") from error
         if not isinstance(found, Mapping) or not all(isinstance(key, str) for key in found):
-            raise InputError(f"{text}: frame {frame}: must return a dict by names")
+            raise InputError(f"{text}: frame {frame}: must return a dict with names as keys")
         definitions = {key: _as_xml(value) for key, value in found.items() if "." not in key}
         try:
             values = as_text({key: value for key, value in found.items() if "." in key})

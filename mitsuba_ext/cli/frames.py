@@ -90,7 +90,7 @@ def pictures(
             evaluated.
     """
     if frames is not None and len(re.findall("#+", output.name)) != 1:
-        raise InputError(f"{output}: needs a place for the number of the frame: image.####.exr")
+        raise InputError(f"{output}: needs a place for the frame number: image.####.exr")
     for frame in [None] if frames is None else frames:
         file, values, names = output, tuple(definitions), []
         if frame is not None:

@@ -115,7 +115,7 @@ class LongJob:
                     self._folder.describe(self._renderer.description())
                     self._state = self._folder.load(self.film)
                     if damaged := self._folder.damaged:
-                        report.warn(f"{damaged}: is damaged: going on from the state before it")
+                        report.warn(f"{damaged}: is damaged: continuing from the previous state")
                 self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
@@ -156,7 +156,7 @@ class LongJob:
                     try:
                         keep(is_asked)
                     except OSError as problem:
-                        report.warn(f"the render could not be kept: {problem}; it goes on")
+                        report.warn(f"the render could not be saved: {problem}; it continues")
 
             self._render = LongRender(self._renderer, state, progress)
             goal = Goal(spp, options.until, seconds)
@@ -186,7 +186,7 @@ class LongJob:
                 self._folder.save(state)
             except OSError as problem:
                 # Continue: the disk may have room for the image, which is smaller
-                problem = InputError(f"the render could not be kept: {problem}")
+                problem = InputError(f"the render could not be saved: {problem}")
                 self.failure = self.failure or problem
 
     def _say_what_is_kept(self, spp: int | None, report: Report) -> None:
@@ -195,10 +195,10 @@ class LongJob:
         if spp is None or kept < spp:
             report.note(f"{folder}: continued from {kept} samples per pixel")
         elif kept == spp:
-            report.note(f"{folder}: holds all {kept} samples per pixel already")
+            report.note(f"{folder}: already holds all {kept} samples per pixel")
         else:
             report.warn(
-                f"{folder}: holds {kept} samples per pixel already, and the image shows all of "
+                f"{folder}: already holds {kept} samples per pixel, and the image shows all of "
                 f"them, not {spp}"
             )
 

@@ -36,7 +36,7 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     from ..util.files import make_folder
 
     if len(folders) < 2:
-        raise click.UsageError("there is nothing to merge with: name two folders or more")
+        raise click.UsageError("there is nothing to merge with: name two or more folders")
     if output.exists():
         raise InputError(f"{output}: exists already")
     first, *others = (CheckpointFolder(folder) for folder in folders)
@@ -66,5 +66,5 @@ def merge(folders: Sequence[Path], output: Path) -> int:
 def _loaded(folder: CheckpointFolder) -> RenderState:
     state = folder.load()
     if folder.damaged:
-        say(f"mitsuba-ext: warning: {folder.damaged}: is damaged: the state before it is merged")
+        say(f"mitsuba-ext: warning: {folder.damaged}: is damaged: the previous state is merged")
     return state

@@ -171,13 +171,13 @@ def render(
     if add is not None and checkpoint is None:
         raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
     if add is not None and spp is not None:
-        raise click.UsageError("--add and --spp exclude each other")
+        raise click.UsageError("--add and --spp cannot be combined")
     check_executor(workers, dask)
     if preview is not None and preview.absolute() == output.absolute():
-        raise click.UsageError("--preview must be another file than --output")
+        raise click.UsageError("--preview must differ from --output")
     is_long = checkpoint or until or workers or dask or preview
     if spp is not None and seconds is not None and not is_long:
-        raise click.UsageError("--spp and --time exclude each other, except in a render in batches")
+        raise click.UsageError("--spp and --time cannot be combined, except in a render in batches")
     order = Order(
         scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
         LongOptions(

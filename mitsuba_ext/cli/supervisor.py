@@ -75,7 +75,7 @@ def supervise(arguments: Sequence[str], folder: Path, limit: float = math.inf) -
             reason = _reason(end.code)
             message = f"the process {reason} in this render"
             if end.is_late:
-                reason = f"took more than the {limit:g} s of --limit for a render, and was ended"
+                reason = f"took more than the {limit:g} s of --limit for a render, and was stopped"
                 message = f"a render took more than the {limit:g} s of --limit"
             guilty = marks.blame(folder, end.process, message)
             if not guilty:
@@ -86,7 +86,7 @@ def supervise(arguments: Sequence[str], folder: Path, limit: float = math.inf) -
                 say(f"mitsuba-ext: the process {reason} in the same render again: given up")
                 return 1
             blamed |= guilty
-            say(f"mitsuba-ext: the process {reason}; going on with the others")
+            say(f"mitsuba-ext: the process {reason}; continuing with the others")
 
 
 def without_job(arguments: Sequence[str]) -> list[str]:

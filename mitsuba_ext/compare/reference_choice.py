@@ -78,7 +78,7 @@ def _missed_light(scene: mi.Scene, has_media: bool) -> str:
     smooth |= 0 if has_media else mi.BSDFFlags.Null
     bsdfs = (shape.bsdf() for shape in all_shapes(scene.shapes()))
     if unhittable and any(bsdf is not None and int(bsdf.flags()) & smooth for bsdf in bsdfs):
-        return "the light of point lights or parallel light that smooth surfaces pass on"
+        return "the light of point lights or parallel light that smooth surfaces redirect"
     return ""
 
 

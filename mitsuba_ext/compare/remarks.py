@@ -77,10 +77,10 @@ def _sessions(experiment: Experiment) -> Iterator[str]:
         return
     repeated = [c.label for c in experiment.contenders if any(run.timed_again for run in c.runs)]
     yield (
-        "the runs are of different sessions, between which the speed of the machine may have "
+        "the runs are from different sessions, between which the speed of the machine may have "
         "changed: ratios of times and of efficiencies use times of one session"
         + (f" (timed again for that: {', '.join(repeated)})" if repeated else "")
-        + "; seconds are those of each run's own session"
+        + "; seconds come from each run's own session"
     )
     for contender in others:
         partners = {(run.level, run.round): run for run in first.runs}
@@ -88,7 +88,7 @@ def _sessions(experiment: Experiment) -> Iterator[str]:
         if any(other and not run.times.keys() & other.times.keys() for run, other in pairs):
             yield (
                 f"{contender.label} and {first.label} have no times of a common session in some "
-                f"rounds: the ratios leave these rounds out; running the same command adds them"
+                f"rounds: the ratios omit these rounds; running the same command adds them"
             )
 
 

@@ -72,7 +72,7 @@ from .runs import Run
 
 SCHEMA = 2
 
-#: Number of levels, the last ones, from which the cost of the error of ``until`` is estimated.
+#: The number of last levels from which the cost of reaching the error of ``until`` is estimated.
 _FITTED_LEVELS = 4
 
 _RELATIVE_ERRORS = ("relmse", "relmse_trimmed", "relmse_worst")

@@ -43,8 +43,8 @@ _OF_MITSUBA = ("generatedBy", "pixelAspectRatio", "screenWindowWidth")
 #: The attribute with the render's warnings, a list of sentences as JSON.
 REMARKS = "remarks"
 
-#: What :func:`fault_of` says about files of earlier versions, and of other programs.
-NO_CHECKSUM = "it has no checksum, as files of earlier versions"
+#: The text of :func:`fault_of` about files of earlier versions and of other programs.
+NO_CHECKSUM = "it has no checksum, like files of earlier versions"
 
 
 def check_target(path: Path) -> None:

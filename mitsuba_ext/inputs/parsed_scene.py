@@ -36,7 +36,7 @@ def check_parsed(state: mi.parser.ParserState) -> None:
             name = node.props.plugin_name()
             if name in _IN_SHAPES:
                 raise InputError(
-                    f'the emitter "{name}" is in no shape, and gives no light: put it into one'
+                    f'the emitter "{name}" is in no shape, and gives no light: put it in one'
                     f"{_place(state, node)}"
                 )
 

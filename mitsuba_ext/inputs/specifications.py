@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Value = Union[bool, int, float, str]
 
-#: How an integrator can be specified; see :func:`make_named`.
+#: The ways to specify an integrator; see :func:`make_named`.
 Specification = Union[str, Path, Mapping[str, Any], "mi.Integrator"]
 
 

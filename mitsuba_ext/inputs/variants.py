@@ -32,7 +32,7 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
         why = one_line(error)
         if "backend hasn't been initialized" in why:
             what = "GPU of NVIDIA" if variant.startswith("cuda") else "LLVM library"
-            why = f"Dr.Jit found no {what} that it can use ('mitsuba-ext doctor' looks)"
+            why = f"Dr.Jit found no {what} that it can use ('mitsuba-ext doctor' says why)"
         raise InputError(f'the variant "{variant}" does not start: {why}') from error
     for name in plugins:
         try:

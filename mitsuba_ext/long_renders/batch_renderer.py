@@ -86,7 +86,7 @@ class BatchRenderer(IntegratorBatches):
         its_parameter = f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter'
         if any(getattr(each, "checkpoint", "") for each in with_nested(integrator)):
             raise InputError(
-                f'{its_parameter} "checkpoint" keeps the render already: leave it out, or the '
+                f'{its_parameter} "checkpoint" already saves the render: leave it out, or the '
                 f"options of the command"
             )
         if any(getattr(each, "timeout", 0) > 0 for each in with_nested(integrator)):

@@ -75,7 +75,7 @@ class Bundle:
             InputError: The bundle was damaged in transfer, or the disk has no room for it.
         """
         if self.digest != _digest(self.files, self.folders):
-            raise InputError("the scene was damaged on its way to the worker")
+            raise InputError("the scene was damaged in transfer to the worker")
         with tempfile.TemporaryDirectory(prefix="mitsuba_ext_") as name:
             root = Path(name)
 

@@ -32,7 +32,7 @@ class ReferenceWorkers:
         self, executor: Executor, count: int = 1, plugins: tuple[str, ...] = (), threads: int = 0
     ) -> None:
         if not callable(getattr(executor, "submit", None)):
-            raise InputError(f"an executor has a method submit(), found {executor!r}")
+            raise InputError(f"an executor must have a method submit(), found {executor!r}")
         self._executor, self._count = executor, count
         self._plugins, self._threads = plugins, threads
 

@@ -68,7 +68,7 @@ class CheckpointFolder:
         file = self.path / _DESCRIPTION
         if not file.exists():
             if any((self.path / name).exists() for name in (_STATE, _PREVIOUS_STATE)):
-                raise InputError(f"{file}: is missing: the folder cannot be used any more")
+                raise InputError(f"{file}: is missing: the folder can no longer be used")
             with replacing(file) as temporary:
                 temporary.write_text(json.dumps(description, indent=1, default=str))
                 _flush(temporary)

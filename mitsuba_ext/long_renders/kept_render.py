@@ -69,7 +69,7 @@ class KeptRender:
             state = self._folder.load(sensor.film())
             if damaged := self._folder.damaged:
                 mi.Log(
-                    mi.LogLevel.Warn, f"{damaged}: is damaged: going on from the state before it"
+                    mi.LogLevel.Warn, f"{damaged}: is damaged: continuing from the previous state"
                 )
             if state.done:
                 self._say_what_is_kept(state.spp, goal.spp or 0)
@@ -116,7 +116,7 @@ class KeptRender:
         try:
             self._folder.save(state)
         except OSError as problem:  # a full disk may have room later
-            mi.Log(mi.LogLevel.Warn, f"the render could not be kept: {problem}")
+            mi.Log(mi.LogLevel.Warn, f"the render could not be saved: {problem}")
 
     def _description(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> dict[str, Any]:
         """Everything on which the image depends, except the number of samples."""

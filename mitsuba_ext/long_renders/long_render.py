@@ -158,7 +158,7 @@ class LongRender:
         if error is None and is_endless and len(self.state.done) >= _MIN_BATCHES:
             raise InputError(
                 f"the image is black, or not finite, after {self.state.spp} samples per pixel, and "
-                f"has no relative error that could be reached: limit the samples or the time too"
+                f"has no relative error that could be reached: also limit the samples or the time"
             )
         return error is not None and error <= limit
 

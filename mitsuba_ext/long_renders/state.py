@@ -37,7 +37,7 @@ class BatchResult(NamedTuple):
         contents, has_weights: The data of :class:`~mitsuba_ext.rendering.film_sums.FilmSums`.
         image: The developed film with its AOVs: [height, width, channel].
         channels, image_channel_count: As in :class:`~mitsuba_ext.rendering.batches.Batches`.
-        aov_names: Channels besides those of the image.
+        aov_names: The channels besides the image's.
         learned: The file that the integrator's ``save_learned`` writes, for the other batches;
             empty if there was nothing to learn, ``None`` if the batch did not have to learn.
         totals: The cost of the batch.
@@ -67,7 +67,7 @@ class RenderState:
         done: The batches, in the order in which they were added.
         film: The sum of the contents of their films.
         images: The mean and variance of their images; ``None`` before the first batch.
-        aov_names: Channels besides those of the image.
+        aov_names: The channels besides the image's.
         learned: The state that a batch learned for the others, as in :class:`BatchResult`.
         totals: The total cost of the batches.
     """

@@ -79,7 +79,7 @@ def render_batch(
     with _rendering:
         if learned:
             if digest_of(learned) != digest:
-                raise InputError("what was learned was damaged on its way to the worker")
+                raise InputError("the learned state was damaged in transfer to the worker")
             _learned = digest, learned
         if _kept is None or _kept.request != request:
             _kept = None  # first, because Dr.Jit compiles the methods of all living objects

@@ -107,7 +107,7 @@ class Workers(Executor):
             return None
         name = signal.Signals(-process.exitcode).name
         return WorkerKilledError(
-            f"its process was killed ({name}), by somebody, or because memory ran out"
+            f"its process was killed ({name}), by a user or because memory ran out"
         )
 
     def _submitted(self, number: int, function, arguments, options) -> Future:

@@ -30,8 +30,8 @@ def refuse_geometry(plugin: str, params: Any) -> None:
     for key, value in params.items():
         if str(key).rpartition(".")[2] in _GEOMETRY and dr.grad_enabled(value):
             raise NotImplementedError(
-                f'"{plugin}": there are no gradients with respect to "{key}", which moves things; '
-                f'use "prb" or "prb_projective"'
+                f'"{plugin}": there are no gradients with respect to "{key}", which changes '
+                f'geometry; use "prb" or "prb_projective"'
             )
 
 

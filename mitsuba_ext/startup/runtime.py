@@ -104,7 +104,7 @@ def check_meshes(mesh: type) -> None:
 def _wrong_version(found: str) -> InstallationError:
     first, end = (".".join(map(str, version)) for version in MITSUBA_VERSIONS)
     return InstallationError(
-        f"mitsuba_ext works with Mitsuba from {first} up to, not including, {end}, but "
+        f"mitsuba_ext works with Mitsuba from {first} up to, but not including, {end}, but "
         f'{found} is installed: run `pip install "mitsuba>={first},<{end}"`.'
     )
 

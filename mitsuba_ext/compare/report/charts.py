@@ -119,9 +119,9 @@ def _notes(
     if key == "seconds":
         lines.append(f"Dotted: as efficient as {first} (error · time is constant).")
     else:
-        lines.append("Dotted: slope −1, that of independent samples.")
+        lines.append("Dotted: slope −1, as for independent samples.")
     if target is not None:
-        lines.append(f"Dashed: the error asked for, {formats.short(target)}.")
+        lines.append(f"Dashed: the target error, {formats.short(target)}.")
     below = sum(
         run["relmse"] is not None and run["relmse"] <= 0 for one in integrators
         for run in one["runs"]

@@ -155,7 +155,7 @@ def _compilation(integrator: Record, _level: Record) -> Mapping[str, float | Non
 
 
 _RUN = [
-    _figure("time", formats.seconds, "seconds", "Learning included, compilation not", "run"),
+    _figure("time", formats.seconds, "seconds", "Includes learning, not compilation", "run"),
     _figure("samples", formats.plain, "spp", "Samples per pixel", "run"),
 ]
 
@@ -180,10 +180,10 @@ _WORK = [
     _figure("shadow", formats.count, "rays_shadow", "Shadow rays that were traced", "work"),
     _figure(
         "shadow share", formats.percent, "shadow_share",
-        "Shadow rays traced, in percent of the connections to lights", "work",
+        "Shadow rays traced, as a percentage of the connections to lights", "work",
     ),
     _figure(
-        "zero", formats.percent, "zero_radiance", "Camera samples that brought no light", "work"
+        "zero", formats.percent, "zero_radiance", "Camera samples without light", "work"
     ),
     _figure("memory", formats.byte_count, "memory", "Peak of one run", "work"),
     _figure("launches", formats.plain, "launches", "Kernel launches of one run", "work"),

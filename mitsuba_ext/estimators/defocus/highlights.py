@@ -136,7 +136,8 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
 
 def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
     """The indices of the highlights to spread, out of the highlights with a radius above 0: if all
-    of them would cover too many pixels, those with the largest brightness per covered pixel."""
+    of them would cover too many pixels, the highlights with the largest brightness per covered
+    pixel."""
     covered = math.pi * np.square(radius.numpy())
     order = np.flatnonzero(covered)
     if covered.sum() > _MAX_COVERED * size.count:

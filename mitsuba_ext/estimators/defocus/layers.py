@@ -130,8 +130,8 @@ class LayerSums:
         color: The RGB of the samples that hit the layer.
         blur: The blurs of these samples.
         hits: The number of these samples.
-        known: The number of samples that show whether the layer is there: those that hit a surface
-            in it or behind it.
+        known: The number of samples that hit a surface in the layer or behind it, and so show
+            whether the layer is there.
         guides: For a denoiser: sums of the albedo's RGB and of the shading normal, and the number
             of hits on lights. Empty if there is no denoiser.
         glow: The sums of the blurs times the brightness of the samples, and of this brightness;

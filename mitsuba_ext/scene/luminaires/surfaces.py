@@ -24,7 +24,7 @@ def surface(name: str, shape: mi.Shape | None, is_projected: bool = False) -> Su
         RuntimeError: The light has no shape.
     """
     if shape is None:
-        raise RuntimeError(f'"{name}": the light needs a shape: put it into one')
+        raise RuntimeError(f'"{name}": the light needs a shape: put it in one')
     kind = mi.ShapeType(int(shape.shape_type()))
     if kind == mi.ShapeType.Rectangle:
         return (ProjectedRectangleSurface if is_projected else RectangleSurface)(shape)

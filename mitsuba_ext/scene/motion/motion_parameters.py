@@ -34,7 +34,7 @@ def read_motion(plugin: str, props: mi.Properties) -> Motion:
     simple = [k for k in ("translate", "axis", "angle", "begin", "end") if k in props]
     if keys and simple:
         raise ValueError(
-            f'"{plugin}": the parameters "{simple[0]}" and "{keys[0]}" exclude each other: give a '
+            f'"{plugin}": the parameters "{simple[0]}" and "{keys[0]}" cannot be combined: give a '
             f"displacement and a turn, or poses at times"
         )
     return _keyed(plugin, props, keys) if keys else _uniform(plugin, props)
@@ -61,7 +61,7 @@ def _uniform(plugin: str, props: mi.Properties) -> Motion:
         raise ValueError(f'"{plugin}": the parameter "axis" must not be zero')
     if "angle" not in props:
         raise ValueError(
-            f'"{plugin}": the parameter "axis" asks for the parameter "angle", in degrees'
+            f'"{plugin}": the parameter "axis" needs the parameter "angle", in degrees'
         )
     angle = math.radians(read_parameter(plugin, props, "angle", 0.0))
     center = _vector(plugin, props, "center", (0, 0, 0))

@@ -60,7 +60,7 @@ class EllipticalCone:
         ρ = dr.sqrt(r_2 * (2 - versine) / f) / dr.maximum(1 - versine, dr.rsqrt(1 + k))
         x, y = self.tan_x * ρ * cosine, self.tan_y * ρ * sine
         # ----- The point where the ray hits the disk, relative to the point on the axis -----
-        # Without division by the height: this is exact also for a distant disk seen edge on
+        # Without division by the height: this is exact even for a distant disk seen edge on
         distance_2 = dr.square(self.along) + dr.square(self.height)
         to_plane = dr.maximum(self.height - x * self.along, 1e-37)
         x_disk = self.shift + x * distance_2 / to_plane

@@ -18,7 +18,7 @@ def checked_points(function: str, x: npt.ArrayLike, most_axes: int = 1) -> Float
     """The points as an array of shape (N,), or with two axes also (N, D).
 
     Raises:
-        ValueError: The shape is different, there are no points, or some are outside of the unit
+        ValueError: The shape is different, there are no points, or some are outside the unit
             cube.
     """
     x = np.asarray(x, float)
@@ -27,7 +27,7 @@ def checked_points(function: str, x: npt.ArrayLike, most_axes: int = 1) -> Float
         raise ValueError(f"{function}: points of shape {shapes} expected, not {x.shape}")
     # This form of the condition also rejects NaN
     if not (x.min() >= 0 and x.max() <= 1):
-        raise ValueError(f"{function}: there are points outside of the unit cube, or NaN")
+        raise ValueError(f"{function}: there are points outside the unit cube, or NaN")
     return x
 
 

@@ -63,7 +63,7 @@ def points(
             raise ValueError(f"points: {name} is {value}, not an integer of at least 1")
     rng = np.random.default_rng(seed)
     x = _MAKERS[pattern](count, dimension, rng)
-    # Points stay below 1, also when they are rounded to single precision
+    # Points stay below 1 even when rounded to single precision
     return np.minimum(x, 1 - 2.0**-24)
 
 

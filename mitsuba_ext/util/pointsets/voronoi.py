@@ -17,11 +17,12 @@ from .line import FloatArray, cell_lengths, checked_points
 
 BOUNDARIES = ("clip", "torus")
 
-#: With ``clip``, points are moved to at least this distance from the border: Qhull must distinguish
-#: them from their mirror images.
+#: The minimum distance from the border to which points are moved with ``clip``: Qhull must
+#: distinguish them from their mirror images.
 _BORDER = 1e-7
 
-#: Points closer than this, by dimension, are treated as equal: Qhull cannot distinguish them.
+#: The distance, by dimension, below which points are treated as equal: Qhull cannot distinguish
+#: them.
 _SPACING = {2: 1e-10, 3: 1e-7}
 
 #: The maximum errors of the sum of all cells: with only the images near the domain (a missing image
@@ -52,7 +53,7 @@ def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArra
         Array of shape (N,).
 
     Raises:
-        ValueError: There are no points, or some are outside of the domain; D is too large; the
+        ValueError: There are no points, or some are outside the domain; D is too large; the
             boundary is unknown; the cells do not fill the domain, because of rounding.
     """
     x = checked_points("voronoi_weights", points, 2)

@@ -16,7 +16,7 @@ JOE_KUO = [
     (2, [1, 1, 5, 5, 17]),
 ]  # fmt: skip
 
-#: Number of bits of an index for which one table entry is read.
+#: The number of bits of an index for which one table entry is read.
 _BITS = 6
 
 

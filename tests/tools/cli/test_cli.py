@@ -52,7 +52,7 @@ BAD_INPUT = [
         '"neepp": "save_map": {tmp}/none: no such folder',
     ),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "0"], "'--time': 0"),
-    (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "1", "--spp", "1"], "exclude"),
+    (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "1", "--spp", "1"], "combined"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--seed", "4294967296"], "'--seed'"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--size", "8"], 'found "8"'),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--size", "0x8"], 'found "0x8"'),

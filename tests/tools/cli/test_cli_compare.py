@@ -288,7 +288,7 @@ def test_interruption_reports_what_is_finished(run, make_scene, tmp_path, monkey
     command = ("compare", make_scene(), "path", "--spp", 2, "--reference-spp", 64)
     code, out, err = run(*command, "--out", tmp_path / "out")
     assert code == 130 and out.count("report.html") == 1
-    assert err == "interrupted: the results are of the finished runs\n"
+    assert err == "interrupted: the results cover only the finished runs\n"
     assert stored_runs(tmp_path) == [1] and (tmp_path / "out" / "report.html").is_file()
 
 
@@ -351,7 +351,7 @@ def test_integrator_that_takes_the_process_down_is_a_failed_row(
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert out.count("the process ended with exit code 3 in this render") == 1
-    assert err.count("going on with the others") == 1
+    assert err.count("continuing with the others") == 1
     assert stored_runs(tmp_path) == [3, 1]
     files = set(tmp_path.rglob("out/*/*.exr"))
     # The next comparison uses the finished runs
@@ -367,7 +367,7 @@ def test_integrator_that_hangs_is_a_failed_row(troubled, tmp_path):
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert out.count("a render took more than the 15 s of --limit") == 1
-    assert err.count("going on with the others") == 1
+    assert err.count("continuing with the others") == 1
     assert stored_runs(tmp_path) == [3, 1]
 
 

@@ -70,13 +70,13 @@ def test_worker_that_ends_in_order_ends_all(supervise, tmp_path, capfd, code):
 def test_worker_that_dies_in_a_render_is_followed_by_another(supervise, capfd, end, words):
     lines = f"if mark.with_suffix('.crashed').exists(): sys.exit(1)\nbegin(); {end}"
     assert supervise(lines) == (1, ["measure", "measure"])
-    assert f"the process {words}; going on with the others" in capfd.readouterr().err
+    assert f"the process {words}; continuing with the others" in capfd.readouterr().err
 
 
 def test_render_that_takes_too_long_is_ended_and_followed_by_others(supervise, tmp_path, capfd):
     lines = "if mark.with_suffix('.crashed').exists(): sys.exit(1)\nbegin(); time.sleep(20)"
     assert supervise(lines, limit=0.2) == (1, ["measure", "measure"])
-    assert "took more than the 0.2 s of --limit for a render, and was ended; going on" in (
+    assert "took more than the 0.2 s of --limit for a render, and was stopped; continuing" in (
         capfd.readouterr().err)
     crashed = tmp_path / "scene" / "a.crashed"
     assert crashed.read_text() == "a render took more than the 0.2 s of --limit"

@@ -132,7 +132,7 @@ def test_other_ways_to_keep_or_measure_it_are_refused(run, make_scene, scene, tm
     xml = '<integrator type="composed_path"><string name="checkpoint" value="a"/></integrator>'
     path = make_scene(integrator=xml)
     code, _, err = run("render", path, "-o", tmp_path / "a.exr", "--checkpoint", tmp_path / "b")
-    assert code == 2 and '"checkpoint" keeps the render already' in err
+    assert code == 2 and '"checkpoint" already saves the render' in err
     code, _, err = run("render", path, "-o", tmp_path / "a.exr", "--time", 1)
     assert code == 2 and "--time would measure" in err
     kept = "neepp:checkpoint=a"

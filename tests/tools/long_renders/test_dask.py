@@ -35,7 +35,7 @@ def test_without_dask_one_sentence_says_what_to_install(run, make_scene, tmp_pat
 def test_who_renders_is_said_once(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr",
                        "--dask", "tcp://127.0.0.1:1", "--workers", 2)  # fmt: skip
-    assert code == 2 and "--workers and --dask exclude each other" in err
+    assert code == 2 and "--workers and --dask cannot be combined" in err
 
 
 # ---- A cluster ----

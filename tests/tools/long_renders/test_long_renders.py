@@ -312,9 +312,9 @@ def test_the_state_before_a_damaged_one_is_kept_until_there_is_a_newer(
     monkeypatch.setattr(os, "replace", replace)
     assert names == ["state.npz"] and CheckpointFolder(kept).load().spp == 16
     code, _, err = run("merge", kept, kept, "-o", tmp_path / "all")
-    assert code == 2 and err.count("state.npz: is damaged: the state before it is merged") == 2
+    assert code == 2 and err.count("state.npz: is damaged: the previous state is merged") == 2
     code, _, err = run(*command, 48)
-    assert code == 0 and "state.npz: is damaged: going on from the state before it" in err
+    assert code == 0 and "state.npz: is damaged: continuing from the previous state" in err
     assert folder.load().spp == 48 and folder.damaged is None
     (kept / "state.npz").unlink()
     assert folder.load().spp == 16
@@ -327,7 +327,7 @@ def test_a_folder_that_does_not_say_what_it_holds_is_refused(run, make_scene, tm
     (kept / "render.json").unlink()
     for name in ("state.npz", "state.before.npz"):
         code, _, err = run(*command, 32)
-        assert code == 2 and "render.json: is missing: the folder cannot be used any more" in err
+        assert code == 2 and "render.json: is missing: the folder can no longer be used" in err
         (kept / name).unlink()
     assert run(*command, 32)[0] == 0
 

@@ -91,7 +91,7 @@ def _errors() -> dict[str, tuple[Scene, str]]:
         "zero_axis": ({"axis": [0, 0, 0], "angle": 1.0, "cube": cube}, "must not be zero"),
         "backwards": ({**line, "begin": 2.0, "cube": cube}, '"begin" is 2'),
         "not_a_number": ({"translate": [float("nan"), 0, 0], "cube": cube}, "finite"),
-        "mixed": ({**line, **poses}, "exclude each other"),
+        "mixed": ({**line, **poses}, "cannot be combined"),
         "gap": ({**poses, "pose_3": T(), "time_3": 4.0}, "pose_3"),
         "one_pose": ({"pose_0": T(), "time_0": 0.0, "cube": cube}, "two at least"),
         "order": ({**poses, "time_1": 0.0}, '"time_1" is 0'),
