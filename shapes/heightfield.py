@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext.scene.lightweight.geometry import Lightweight
-from mitsuba_ext.scene.lightweight.height_tree import MOST_CELLS, HeightTree, cell
+from mitsuba_ext.scene.lightweight.height_tree import MAX_CELLS, HeightTree, cell
 from mitsuba_ext.scene.lightweight.interaction import Triangle, surface_interaction
 from mitsuba_ext.scene.placeholder import span
 from mitsuba_ext.startup import registry
@@ -243,10 +243,10 @@ class Heightfield(mi.Mesh):
 
     def _check(self, values: np.ndarray, key: str) -> None:
         rows, columns = values.shape
-        if not 2 <= min(values.shape) <= max(values.shape) <= MOST_CELLS + 1:
+        if not 2 <= min(values.shape) <= max(values.shape) <= MAX_CELLS + 1:
             raise self._error(
                 f'the parameter "{key}" has {columns} x {rows} values; each side must have 2 to '
-                f"{MOST_CELLS + 1}"
+                f"{MAX_CELLS + 1}"
             )
         if not np.isfinite([values.min(), values.max()]).all():
             row = next(i for i, row in enumerate(values) if not np.isfinite(row).all())

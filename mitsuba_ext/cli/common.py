@@ -22,13 +22,13 @@ INTERRUPTED = 130
 MAX_SEED = 2**32 - 1
 
 #: The maximum number of threads of a process.
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 
 #: The width of tables written to a file or a pipe, in characters.
 _PIPE_WIDTH = 160
 
 
-class Size(click.ParamType):
+class SizeType(click.ParamType):
     name = "size"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
@@ -38,7 +38,7 @@ class Size(click.ParamType):
         return int(match.group(1)), int(match.group(2))
 
 
-class Crop(click.ParamType):
+class CropType(click.ParamType):
     name = "crop"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
@@ -48,7 +48,7 @@ class Crop(click.ParamType):
         return tuple(map(int, match.groups()))
 
 
-class Numbers(click.ParamType):
+class NumberList(click.ParamType):
     name = "numbers"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
@@ -57,7 +57,7 @@ class Numbers(click.ParamType):
         return tuple(map(int, value.split(",")))
 
 
-class Every(click.ParamType):
+class IntervalType(click.ParamType):
     name = "interval"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Interval:
@@ -94,11 +94,11 @@ def scene_options(command: Callable) -> Callable:
     """Adds the options that ``render`` and ``compare`` share."""
     for decorator in (
         click.option(
-            "--size", type=Size(), metavar="WxH",
+            "--size", type=SizeType(), metavar="WxH",
             help="Size of the image, instead of the film's.",
         ),
         click.option(
-            "--crop", type=Crop(), metavar="WxH+X+Y",
+            "--crop", type=CropType(), metavar="WxH+X+Y",
             help="Render W by H pixels of the image, starting at column X and row Y.",
         ),
         click.option(

@@ -18,7 +18,7 @@ from . import candidates, supervisor
 from .common import (
     INTERRUPTED,
     FilledPath,
-    Numbers,
+    NumberList,
     check_executor,
     executor_options,
     say,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     help="Equal time: S seconds for each run, including learning but not compilation.",
 )
 @click.option(
-    "--sweep", type=Numbers(), metavar="N,N,…",
+    "--sweep", type=NumberList(), metavar="N,N,…",
     help="Several numbers of samples, for convergence plots and slopes.",
 )
 @click.option(

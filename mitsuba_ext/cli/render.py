@@ -18,9 +18,9 @@ from ..util.parameters import MOST_SPP
 from . import candidates
 from .common import (
     MAX_SEED,
-    MOST_THREADS,
-    Every,
+    MAX_THREADS,
     FilledPath,
+    IntervalType,
     check_executor,
     executor_options,
     scene_options,
@@ -78,7 +78,7 @@ from .frames import FrameRange, Sensors, pictures
     "frames or sensors, each has a subfolder.",
 )
 @click.option(
-    "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
+    "--every", type=IntervalType(), default="60s", metavar="TIME", show_default=True,
     help="How often --checkpoint saves the render and writes FILE, and --preview is written: 60s, "
     "10m, 2h or 100spp.",
 )
@@ -109,7 +109,7 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     # With one thread, Mitsuba 3.9.1 deadlocks when it reads or writes an EXR file
-    "--threads", type=click.IntRange(2, MOST_THREADS), metavar="N",
+    "--threads", type=click.IntRange(2, MAX_THREADS), metavar="N",
     help="Threads of each process, from 2 to 1024.  [default: all cores, divided among --workers]",
 )
 @scene_options

@@ -23,7 +23,7 @@ from .stored_arrays import DamagedError, Header, StoredArrays
 _FORMAT, _DIGEST = "format", "digest"
 
 #: The maximum number of arrays in a file, and the number of bytes read at once.
-_MOST_ARRAYS, _CHUNK = 1 << 12, 1 << 20
+_MAX_ARRAYS, _CHUNK = 1 << 12, 1 << 20
 
 
 def write(
@@ -117,7 +117,7 @@ class _Archive:
         self._zip = zipfile.ZipFile(io.BytesIO(read_bytes(path)))
         members = self._zip.infolist()
         names = [member.filename for member in members]
-        if len(names) > _MOST_ARRAYS or len(set(names)) < len(names):
+        if len(names) > _MAX_ARRAYS or len(set(names)) < len(names):
             raise ValueError("no archive of arrays")
         self._members = {m.filename.removesuffix(".npy"): m for m in members}
         self.headers = {name: self._opened(name)[1] for name in self._members}

@@ -8,7 +8,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 #: The maximum size of a number, in bytes.
-_MOST_BYTES = 8
+_MAX_BYTES = 8
 
 
 class DamagedError(ValueError):
@@ -91,7 +91,7 @@ class StoredArrays:
         dtype, found = self._headers[name]
         self.require(
             dtype.kind in kinds and len(found) == len(shape) and dtype.isnative
-            and (dtype.itemsize <= _MOST_BYTES or dtype.kind == "U"),
+            and (dtype.itemsize <= _MAX_BYTES or dtype.kind == "U"),
             f'the array "{name}" is of type {dtype} and shape {found}',
         )  # fmt: skip
         fits = all(there == wanted or wanted is None for there, wanted in zip(found, shape))

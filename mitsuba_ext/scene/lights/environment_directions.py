@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..bounds import scene_bounds
 
 #: The minimum sine of the polar angle: at the poles, densities would be infinite.
-LEAST_SINE = 1e-7
+MIN_SINE = 1e-7
 
 
 class EnvironmentDirections:
@@ -58,7 +58,7 @@ class EnvironmentDirections:
         maps it, and the sine of its polar angle."""
         sin_theta, cos_theta = dr.sincos(uv.y * dr.pi)
         sin_phi, cos_phi = dr.sincos(uv.x * dr.two_pi)
-        sin_theta = dr.maximum(sin_theta, LEAST_SINE)
+        sin_theta = dr.maximum(sin_theta, MIN_SINE)
         d = mi.Vector3f(sin_phi * sin_theta, cos_theta, -cos_phi * sin_theta)
         return self._to_world @ d, sin_theta
 
@@ -68,5 +68,5 @@ class EnvironmentDirections:
         v = self._to_local @ d
         u = dr.atan2(v.x, -v.z) * dr.inv_two_pi
         # Accurate near the poles, where the cosine hardly changes
-        sin_theta = dr.maximum(dr.sqrt(dr.square(v.x) + dr.square(v.z)), LEAST_SINE)
+        sin_theta = dr.maximum(dr.sqrt(dr.square(v.x) + dr.square(v.z)), MIN_SINE)
         return mi.Point2f(u, dr.atan2(sin_theta, v.y) * dr.inv_pi), sin_theta

@@ -29,7 +29,7 @@ _CELL_BITS = _BITS + 1
 _CELL_MASK = (1 << _CELL_BITS) - 1
 
 #: The maximum number of cells along a side of the grid.
-MOST_CELLS = 1 << _CELL_BITS
+MAX_CELLS = 1 << _CELL_BITS
 
 #: The largest number with which ranges of heights are stored.
 _RANGE = 0xFFFF
@@ -101,7 +101,7 @@ class HeightTree:
 
     Parameters:
         values: The heights, finite. Shape (rows, columns), at least (2, 2) and at most
-            ``MOST_CELLS`` cells along each side; float32, float16 or uint16.
+            ``MAX_CELLS`` cells along each side; float32, float16 or uint16.
 
     Attributes:
         heights (Heights): The heights on the device.

@@ -12,7 +12,7 @@ from .surface import Surface, SurfacePoint
 
 #: The maximum number of triangles of a mesh that is sampled by solid angle: each sample visits all
 #: triangles.
-MOST_TRIANGLES = 16
+MAX_TRIANGLES = 16
 
 #: The number of floats per triangle in the table: a corner, two edges, a sign, and three normals.
 _WORDS = 20

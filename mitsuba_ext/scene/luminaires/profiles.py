@@ -10,7 +10,7 @@ from .ies import Intensities
 
 #: The minimum ratio of the light's projected area to its area: radiance is intensity divided by the
 #: projected area, and real luminaires are not flat.
-LEAST_COSINE = 0.1
+MIN_COSINE = 0.1
 
 
 class Profile:
@@ -74,7 +74,7 @@ class AngularTable(Profile):
             row = dr.clip(mi.Int32(turn), 0, self._rows - 2)
             value, other = (self._row(mi.UInt32(row + i), vertical) for i in (0, 1))
             value = dr.lerp(value, other, dr.clip(turn - row, 0, 1))
-        return value / dr.maximum(cosine, LEAST_COSINE)
+        return value / dr.maximum(cosine, MIN_COSINE)
 
     def _row(self, row: mi.UInt32, vertical: mi.Float) -> mi.Float:
         """Interpolates linearly in ``vertical``, an angle in steps of the table."""

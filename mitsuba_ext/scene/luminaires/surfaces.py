@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from .disk import DiskSurface, is_round
-from .mesh import MOST_TRIANGLES, MeshSurface, triangle_count
+from .mesh import MAX_TRIANGLES, MeshSurface, triangle_count
 from .rectangle import ProjectedRectangleSurface, RectangleSurface
 from .sphere import SphereSurface
 from .surface import Surface
@@ -38,7 +38,7 @@ def surface(name: str, shape: mi.Shape | None, is_projected: bool = False) -> Su
     if kind == mi.ShapeType.Disk:
         return DiskSurface(shape) if is_round(shape) else Surface(shape)
     if kind == mi.ShapeType.Mesh:
-        is_small = triangle_count(shape) <= MOST_TRIANGLES
+        is_small = triangle_count(shape) <= MAX_TRIANGLES
         return MeshSurface(shape) if is_small else Surface(shape)
     raise NotImplementedError(
         f'"{name}": cannot sample the solid angle of a shape "{shape.class_name()}"; give the '

@@ -12,7 +12,7 @@ _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 #: The maximum number of intervals that digits distinguish: the numbers have 24 bits, and the next
 #: power of the largest base still fits into 32 bits.
-_MOST_INTERVALS = 1 << 24
+_MAX_INTERVALS = 1 << 24
 
 
 class Halton:
@@ -61,7 +61,7 @@ def radical_inverse(
 ) -> mi.Float:
     """The radical inverse of an index below ``count``: its digits, randomly shifted, behind the
     radix point, followed by the digits of a random number."""
-    count = dr.opaque(mi.UInt32, min(count, _MOST_INTERVALS))
+    count = dr.opaque(mi.UInt32, min(count, _MAX_INTERVALS))
     # ``power`` is the number of intervals that the digits so far distinguish
     power, digits, rest, word = mi.UInt32(1), mi.UInt32(0), mi.UInt32(index), mixed(seed)
 

@@ -22,13 +22,13 @@ from .scrambling import mixed
 
 #: The maximum number of levels. Each square of 2^7 x 2^7 pixels has a separate sequence: a point's
 #: index has only 32 bits, and errors of lower frequency are already small.
-_MOST_LEVELS = 7
+_MAX_LEVELS = 7
 
 
 def level_count(count: int) -> int:
     """The number of levels k if squares of 2^k x 2^k pixels share a sequence, and each pixel takes
     ``count`` points. All indices of points must be below 2^32."""
-    return min(_MOST_LEVELS, (32 - (count - 1).bit_length()) // 2)
+    return min(_MAX_LEVELS, (32 - (count - 1).bit_length()) // 2)
 
 
 @dataclass
