@@ -158,8 +158,7 @@ def check_executor(workers: int | None, dask: str | None) -> None:
 
 
 def kernels_compiled() -> int:
-    """The number of kernels that were not in Dr.Jit's cache and that this process had to
-    compile."""
+    """The number of kernels that this process had to compile because Dr.Jit's cache lacked them."""
     import drjit as dr
 
     _launches, _loaded, compiled = dr.detail.launch_stats()

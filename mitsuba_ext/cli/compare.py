@@ -217,8 +217,7 @@ def _reference_workers(
 
 
 def _has_trouble(scene: Mapping[str, Any]) -> bool:
-    """Whether the scene or an integrator failed, or the reference was too noisy to measure an
-    error."""
+    """Whether the scene or an integrator failed, or the reference was too noisy for an error."""
     return bool(scene["error"]) or any(
         item["error"] or any(level["refused"] for level in item["levels"])
         for item in scene["integrators"]

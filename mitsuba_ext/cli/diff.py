@@ -126,8 +126,7 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
     differing = int(signed.any(axis=2).sum())
     y, x, channel = np.unravel_index(np.argmax(np.abs(signed)), signed.shape)
     if differing == 0:
-        # Zero even if both are black. The reference's variance must not be subtracted from an error
-        # of 0
+        # Zero even for black images. The reference's variance must not be subtracted from it
         errors = metrics.Errors(**dict.fromkeys(_FIGURES, 0.0))
     else:
         try:

@@ -25,8 +25,7 @@ class FrameParameters(NamedTuple):
 
 
 def load_function(text: str) -> Callable[[int], FrameParameters]:
-    """Loads the user's function, and wraps it in a function that maps a frame's number to its
-    parameters.
+    """Loads the user's function, and wraps it in one from a frame's number to its parameters.
 
     Args:
         text: ``file.py:function`` or ``module:function``. The function returns a dict. Keys with a

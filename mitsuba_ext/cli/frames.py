@@ -86,8 +86,7 @@ def pictures(
         frames: The frame numbers; ``None`` for a single image.
 
     Raises:
-        InputError: The file name has no place for the frame number, or an expression cannot be
-            evaluated.
+        InputError: The file name has no place for the frame number, or an expression is invalid.
     """
     if frames is not None and len(re.findall("#+", output.name)) != 1:
         raise InputError(f"{output}: needs a place for the frame number: image.####.exr")

@@ -56,8 +56,7 @@ def is_finished(order: Order, picture: Picture) -> bool:
     long = order.long
     if long is None or long.folder is None:
         return True
-    # This call may request more samples than the last one. To check the error, the state must be
-    # loaded
+    # This call may request more samples than the last one. The error is in the state
     if long.until is not None:
         return False
     return not order.spp or CheckpointFolder(long.folder / picture.name).load().spp >= order.spp
@@ -167,8 +166,7 @@ def render_image(
             if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)
             if is_new:
-                # The render's kernels take longer to compile, and nothing can be printed in the
-                # meantime
+                # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 report.note("compiling kernels (later renders like this one find them in a cache)")
             if order.denoise:
                 guides = render_guides(job.scene, job.sensor, seed)

@@ -47,8 +47,7 @@ def merge(folders: Sequence[Path], output: Path) -> int:
             state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
-    # Made under a temporary name first, because an unfinished folder could be mistaken for the
-    # start of a render
+    # Made under a temporary name: an unfinished folder could be mistaken for a render's start
     make_folder(output.parent)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as made:

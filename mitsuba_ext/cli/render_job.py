@@ -1,5 +1,4 @@
-"""A single render of a scene file: in passes with Mitsuba's integrators, by ``render()`` with
-ours."""
+"""One render of a scene file: in passes with Mitsuba's integrators, by ``render()`` with ours."""
 
 from __future__ import annotations
 

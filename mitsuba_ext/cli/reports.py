@@ -63,8 +63,8 @@ class Report:
 
     @contextlib.contextmanager
     def bars(self) -> Iterator[Progress]:
-        """Progress bars, if a terminal shows them. Their tasks have the field ``left`` for the text
-        of :func:`time_left`."""
+        """Progress bars, if a terminal shows them. The field ``left`` of their tasks is the text of
+        :func:`time_left`."""
         column = TextColumn("{task.fields[left]}", markup=False)
         with progress_bars(column, is_shown=not self._is_quiet and not self._as_json) as bars:
             yield bars

@@ -16,8 +16,8 @@ from .common import INTERRUPTED, say
 
 class Stop(interrupts.InterruptHandler):
     """Handles the first signal, and remembers it. The thread of :func:`_watching` handles later
-    signals, which it receives at once. (Python calls this handler only after the running native
-    code has returned.)"""
+    signals, which it receives at once. (Python calls this handler only after running native code
+    returns.)"""
 
     is_writing = False
 
@@ -56,8 +56,7 @@ def stopping() -> Iterator[Stop]:
 
 @contextlib.contextmanager
 def _watching(stop: Stop) -> Iterator[None]:
-    """Runs a thread that receives signals at once, even while native code runs and Python cannot
-    call handlers."""
+    """Runs a thread that receives signals at once, even while native code blocks handlers."""
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
 

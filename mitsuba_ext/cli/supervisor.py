@@ -41,8 +41,7 @@ MEASURE, STORED = JOBS = ("measure", "stored")
 #: kill after 10 to 30 seconds, and the report takes a few.
 GRACE = 3.0
 
-#: The exit codes of a worker that did not crash: success, failed integrators, bad input,
-#: interrupted.
+#: Exit codes of a worker that did not crash: success, failed integrators, bad input, interrupted.
 _IN_ORDER = (0, 1, 2, INTERRUPTED)
 
 #: The time between two checks for received signals, in seconds.

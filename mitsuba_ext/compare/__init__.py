@@ -1,5 +1,4 @@
-"""Compares integrators by speed and error. In a notebook, the equivalent of ``mitsuba-ext compare``
-is::
+"""Compares integrators by speed and error. The equivalent of ``mitsuba-ext compare`` in Python::
 
     import mitsuba_ext
     import mitsuba as mi

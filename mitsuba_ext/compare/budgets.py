@@ -8,8 +8,7 @@ from numbers import Real
 
 from ..util.errors import InputError
 
-#: The samples per pixel with which ``until`` starts. With fewer, an integrator may have no pilot
-#: pass.
+#: The initial samples per pixel of ``until``. With fewer, an integrator may have no pilot pass.
 _FIRST_SPP = 8
 
 
@@ -65,8 +64,7 @@ def sweep(counts: list[int] | tuple[int, ...]) -> Budget:
 
 
 def until(relmse: float) -> Budget:
-    """Samples are doubled, starting with 8 per pixel, until the mean relMSE is at most
-    ``relmse``."""
+    """Doubles the samples, from 8 per pixel, until the mean relMSE is at most ``relmse``."""
     return Budget("until", (_positive(relmse, "relMSE"),))
 
 

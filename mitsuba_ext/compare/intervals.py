@@ -18,8 +18,7 @@ CONFIDENCE = 0.95
 
 
 class Estimate(NamedTuple):
-    """A value and its confidence interval; the bounds are ``None`` if unknown, as for a single
-    run."""
+    """A value and its confidence interval; unknown bounds, as of a single run, are ``None``."""
 
     value: float
     low: float | None = None
@@ -44,8 +43,7 @@ def ratio(
     Args:
         numerator, denominator: The estimates whose values are divided.
         pairs: One (numerator, denominator) for each round in which both ran. The interval comes
-            from their ratios, in which influences shared by two runs of a round (machine load,
-            seed) cancel.
+            from their ratios, in which shared influences of a round (machine load, seed) cancel.
     """
     if numerator is None or denominator is None or not denominator.value > 0:
         return None

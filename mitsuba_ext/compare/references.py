@@ -36,8 +36,7 @@ from .reference_choice import choose_integrator
 if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
 
-#: The number of batches of a rendered reference. Their sample variance gives the reference's
-#: variance.
+#: The number of batches of a rendered reference. Their variance gives the reference's variance.
 BATCH_COUNT = 16
 MIN_BATCH_COUNT = 8
 
@@ -59,8 +58,7 @@ class Reference:
         variance: Variance of ``mean``, same shape; ``None`` if unknown.
         path: The file that holds it.
         metadata: The metadata of that file.
-        fault: How the file differs from what this package wrote (:func:`.image_files.fault_of`);
-            empty if it does not.
+        fault: How the file differs from what we wrote (:func:`.image_files.fault_of`), or empty.
     """
 
     mean: np.ndarray
@@ -142,8 +140,7 @@ def render_reference(
         enough: The number of samples that a stored reference must have to be used. By default,
             ``spp``.
         workers: The workers that render it. By default, this process.
-        warn: A function that is called with a sentence about each damaged stored file, which is
-            rendered anew.
+        warn: A function that is called with a sentence about each damaged stored file.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or

@@ -34,8 +34,7 @@ _LEGEND_CPU = " Seconds are CPU time of all threads."
 #: The width of the output to a file or a pipe, in characters.
 _PIPE_WIDTH = 160
 
-#: The minimum width of the labels, in characters; columns that do not fit beside them go to another
-#: table.
+#: The minimum width of labels, in characters; columns that do not fit go to another table.
 _LABEL_WIDTH = 16
 
 

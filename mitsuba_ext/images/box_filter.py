@@ -6,8 +6,7 @@ import functools
 
 import numpy as np
 
-#: The default number of pixels on each side, along each axis, over which a pixel's radiance is
-#: averaged.
+#: The default number of pixels on each side, along each axis, of the box around a pixel.
 RADIUS = 4
 
 

@@ -32,8 +32,7 @@ class CoarseFilm:
 
     @classmethod
     def of(cls, width: int, height: int, count: int) -> CoarseFilm:
-        """A film with about ``count`` samples, at least two per rectangle, so that their variance
-        can be estimated."""
+        """A film with about ``count`` samples, two or more per rectangle for their variance."""
         pixels, scale = width * height, np.sqrt(count / (2 * width * height))
         if scale >= 1:
             film = cls.whole(width, height)

@@ -1,8 +1,7 @@
 """Denoises images with Open Image Denoise [1], through the package ``mitsuba-oidn``.
 
 The albedo and the shading normal of each pixel, if known, guide the denoiser. Each guide is
-denoised first, separately. A denoised image is biased: compare techniques by their images before
-denoising.
+denoised first, separately. Denoised images are biased: compare techniques before denoising.
 
 [1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
 """

@@ -72,8 +72,7 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
         "stopExposure": stop,
         "numExposures": max(2, math.ceil(stop - start)),
     }
-    # Not flip-evaluator's own mean, which is summed in single precision (an error of 0.02 % at
-    # 1920x1080)
+    # Not flip-evaluator's mean, a sum in single precision (an error of 0.02 % at 1920x1080)
     error_map, _, _ = evaluator.evaluate(
         *pixels, "HDR", applyMagma=False, computeMeanError=False, parameters=exposures
     )

@@ -101,8 +101,7 @@ def _exr(
 
 
 def fault_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> str:
-    """Says why the channels and the metadata of an EXR differ from what :func:`write_exr` wrote;
-    empty if they do not."""
+    """How an EXR's channels and metadata differ from what :func:`write_exr` wrote, or empty."""
     if _CHECKSUM not in metadata:
         return NO_CHECKSUM
     try:
@@ -116,7 +115,7 @@ def fault_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -
 
 def remarks_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> list[str]:
     """Warnings about an image that the user names: the remarks of
-    :func:`mitsuba_ext.inputs.scene_remarks` when it was rendered, and whether the file has changed
+    :func:`mitsuba_ext.inputs.scene_remarks` at its render, and whether the file has changed
     since."""
     remarks = []
     with contextlib.suppress(ValueError):
@@ -173,8 +172,7 @@ def open_bitmap(path: Path) -> tuple[mi.Bitmap, list[str], dict[str, object]]:
     """Opens any image that Mitsuba can read, whatever its extension.
 
     Returns:
-        The image, the names of its channels, and its metadata. Metadata texts that are not UTF-8
-        are omitted.
+        The image, the names of its channels, and its metadata, without texts that are not UTF-8.
 
     Raises:
         InputError: The file is missing, damaged, or not an image.

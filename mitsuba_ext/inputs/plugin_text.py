@@ -37,8 +37,7 @@ def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
 
 
 def _meant(text: str) -> str:
-    """The correct form of "bdpt,max_depth=4" or "bdpt: max_depth=4", as a hint; empty for other
-    texts."""
+    """The correct form of "bdpt,max_depth=4" or "bdpt: max_depth=4"; empty for other texts."""
     likely = re.sub(r"\W+", ":", text.strip(), count=1)
     try:
         _parse(likely)

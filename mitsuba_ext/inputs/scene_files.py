@@ -51,8 +51,7 @@ def named_by_absolute_path(files: list[Path], parameters: Mapping[str, str]) -> 
 
 
 def named_in(state: mi.parser.ParserState) -> Iterator[tuple[tuple[object, str], str]]:
-    """The string parameters of a scene's plugins, which can be file names, each with its node and
-    key."""
+    """The string parameters (possibly file names) of a scene's plugins, with nodes and keys."""
     import mitsuba as mi
 
     for node in state.nodes:

@@ -245,8 +245,8 @@ def _unused(path: Path, given: list[str]) -> str:
 
 def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of a scene's dict and of its bitmaps. In spectral variants, Mitsuba's ``bitmap``
-    converts the pixels of a ``mi.Bitmap`` in place: without the copy, loading the dict again would
-    produce another scene."""
+    converts the pixels of a ``mi.Bitmap`` in place: without a copy, the dict would give another
+    scene the next time."""
     import mitsuba as mi
 
     def copy(value: Any) -> Any:

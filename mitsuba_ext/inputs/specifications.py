@@ -283,8 +283,7 @@ def _is_ours(name: str) -> bool:
 
 
 def _knows(name: str, key: str, value: Value) -> bool:
-    """Whether a plugin queries the parameter. False for a plugin that needs others, such as a
-    wrapper."""
+    """Whether a plugin queries the parameter. False if it needs others, as a wrapper does."""
     import mitsuba as mi
 
     properties = mi.Properties(name)

@@ -1,2 +1,1 @@
-"""Renders that consist of many independent batches and can be saved, continued, merged, and
-distributed."""
+"""Renders in independent batches, which can be saved, continued, merged, and distributed."""

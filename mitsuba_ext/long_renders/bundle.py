@@ -59,8 +59,7 @@ class Bundle:
             raise InputError(f"{loaded.source}: cannot be sent to the workers: {error}") from None
         if not is_same:
             raise InputError(f"{loaded.source}: its files have changed since the render began")
-        # The scene may be a link. Mitsuba searches the current folder for names that its resolver
-        # does not find
+        # The scene may be a link. Mitsuba searches the current folder last
         searched = [loaded.path.resolve().parent, *mi.file_resolver(), os.curdir]
         folders = tuple(os.path.abspath(str(folder)) for folder in searched)
         return cls(files, folders, _digest(files, folders))
@@ -68,8 +67,7 @@ class Bundle:
     @contextlib.contextmanager
     def unpacked(self) -> Iterator[Callable[[str], str]]:
         """A context in which the files are in a temporary folder, where Mitsuba finds them. Yields
-        a function that maps the path of a file to its path there; it returns names that are not in
-        the bundle unchanged.
+        a function that maps the path of a file to its path there; it returns other names unchanged.
 
         Raises:
             InputError: The bundle was damaged in transfer, or the disk has no room for it.

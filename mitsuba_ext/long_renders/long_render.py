@@ -38,8 +38,7 @@ class Goal:
         error: The relMSE of the image, estimated from its batches; ``None`` for no limit.
         seconds: The time of this call, in seconds; ``None`` for no limit. The speed of the first
             batches determines how many fit: a render that ended by the clock would be biased
-            towards fast samples. In this process, these batches are short and learn nothing for
-            others.
+            towards fast samples. In this process, they are short and learn nothing for others.
     """
 
     spp: int | None = None
@@ -177,8 +176,7 @@ class LongRender:
 
     @property
     def _is_short(self) -> bool:
-        """Whether the time of this call is, or may be, too short for a batch that learns for
-        others."""
+        """Whether this call's time is, or may be, too short for a batch that learns for others."""
         longest = self._renderer.length(_LARGER_THAN_A_BATCH, teaches=True)
         left = self.goal_spp - self.state.spp
         return self._probes or (self._teaches_late and left < 2 * longest)

@@ -137,8 +137,7 @@ class RenderState:
         self.film.fill(film, self.aov_names)
 
     def fits(self, film: mi.Film) -> bool:
-        """Whether the images fit a film with this size and these channels. If so, fills the
-        film."""
+        """Whether the images fit a film with these channels. If so, fills the film."""
         if not self.done:
             return True
         if self.images.mean.shape[:2] != image_shape(film):

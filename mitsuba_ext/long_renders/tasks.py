@@ -48,8 +48,7 @@ _kept: _Kept | None = None
 #: The digest of the last received learned state, and the state.
 _learned: tuple[str | None, bytes | None] = (None, None)
 
-#: Held while a batch is rendered: a Dask worker has several threads, and Dr.Jit uses all cores for
-#: each batch.
+#: Held while a batch is rendered: Dask workers have threads, and Dr.Jit uses all cores per batch.
 _rendering = threading.Lock()
 
 

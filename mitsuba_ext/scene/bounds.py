@@ -24,7 +24,6 @@ def shape_bounds(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
     if not shape.is_mesh() or shape.vertex_count() == 0:
         return shape.bbox()
     positions = np.array(shape.vertex_positions_buffer())
-    # Each coordinate separately: a reduction along an axis of length three takes NumPy 15 times as
-    # long
+    # Each coordinate separately: NumPy reduces along an axis of length three 15 times as slowly
     axes = [positions[axis::3] for axis in range(3)]
     return mi.ScalarBoundingBox3f([x.min() for x in axes], [x.max() for x in axes])

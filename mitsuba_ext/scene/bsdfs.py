@@ -1,5 +1,4 @@
-"""Finds BSDFs in scenes, including nested ones, and raises errors for BSDFs that light paths cannot
-render."""
+"""Finds BSDFs in scenes, even nested ones, and refuses BSDFs that light paths cannot render."""
 
 from __future__ import annotations
 
@@ -39,12 +38,10 @@ def is_in_table(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
 def has_clear_curves(scene: mi.Scene) -> bool:
     """Whether light passes through a curve, such as one with the BSDF ``hair``.
 
-    No ray hits a curve from inside. A camera path that enters a curve leaves it without an
-    intersection: its only vertex is the entry point. The reverse light path meets the other side of
-    the curve instead.
+    No ray hits a curve from inside. A camera path leaves a curve without an intersection: its only
+    vertex is the entry point. The reverse light path meets the other side of the curve instead.
 
-    The shapes of an instance are not accessible: if the scene has an instance, all shapes in memory
-    are examined."""
+    The shapes of instances are not accessible: with one, all shapes in memory are examined."""
     F = mi.BSDFFlags
     shapes = list(all_shapes(scene.shapes()))
     if has_instances(scene):
@@ -59,8 +56,7 @@ def has_clear_curves(scene: mi.Scene) -> bool:
 
 
 def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
-    """Raises an error if light passes through a curve. For methods whose light paths must meet the
-    curve.
+    """Raises an error if light passes through a curve, for methods whose light paths must meet it.
 
     Parameters:
         what: The beginning of the message, which names the plugin.

@@ -10,8 +10,7 @@ class SceneMark:
 
     Scenes cannot be referenced weakly. An integrator must not hold a scene: if it is the scene's
     own integrator, the two would keep each other alive, and Dr.Jit, which searches the attributes
-    of both for arrays, would never finish. (It does not look into objects of classes such as this
-    one.)
+    of both for arrays, would never finish. (It does not look into objects such as this one.)
 
     Attributes:
         index: Identifies the scene; 0 if it has neither shapes nor lights.

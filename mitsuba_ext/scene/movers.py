@@ -24,14 +24,12 @@ def all_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
 
 
 def is_moving_light(emitter: mi.Emitter) -> bool:
-    """Whether the emitter is a moving light, which has a ``nested`` emitter at rest and a
-    ``motion``."""
+    """Whether the emitter is a moving light, with a ``nested`` emitter and a ``motion``."""
     return isinstance(getattr(emitter, "motion", None), Motion)
 
 
 def is_moving_camera(sensor: mi.Sensor) -> bool:
-    """Whether the sensor is a ``moving_camera``, which has a ``nested`` sensor, a ``motion`` and
-    ``poses``."""
+    """Whether it is a ``moving_camera``, with a ``nested`` sensor, a ``motion`` and ``poses``."""
     return isinstance(getattr(sensor, "motion", None), Motion)
 
 

@@ -17,9 +17,8 @@ def has_unseen_shapes(scene: mi.Scene) -> bool:
 def check_all_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
     """Refuses to render a scene with shapes that the integrator does not see.
 
-    Integrators that see them have the attribute ``sees_all``. Mitsuba's own integrators and
-    integrators of other packages would render the scene without moving shapes and without
-    lightweight shapes.
+    Integrators that see them have the attribute ``sees_all``. Integrators of Mitsuba and of other
+    packages would render the scene without moving and lightweight shapes.
 
     Raises:
         NotImplementedError: The integrator does not see a shape in ``scene``.

@@ -1,9 +1,7 @@
-"""Finds the LLVM library that Dr.Jit would load, and others on this machine, and checks whether
-they work.
+"""Finds the LLVM library that Dr.Jit would load, and others, and checks whether they work.
 
 Dr.Jit loads libLLVM when it is imported. An unusable library crashes at the first kernel instead of
-raising an exception, so a library has to be chosen beforehand. :mod:`.llvm_install` installs one
-that works.
+raising an exception, so a library has to be chosen beforehand. :mod:`.llvm_install` installs one.
 """
 
 from __future__ import annotations
@@ -97,8 +95,7 @@ class Library:
 
     @classmethod
     def at(cls, path: str) -> Library:
-        """The library at ``path``, with the version in the name of its file after resolving
-        links."""
+        """The library at ``path``, with the version in the resolved file's name."""
         resolved = os.path.realpath(path) if os.path.exists(path) else path
         return cls(resolved, _version_in_name(resolved) or _version_in_name(path))
 
@@ -205,8 +202,7 @@ def cpu() -> tuple[str, frozenset[str]]:
 
 
 def fault(library: Library) -> str:
-    """Why Dr.Jit cannot use ``library``, as the end of a sentence about the library; empty if it
-    can.
+    """Why Dr.Jit cannot use ``library``, as the end of a sentence about it; empty if it can.
 
     Old versions are refused. For others, the stored result of a probe decides, if there is one. An
     unknown version, or one newer than :data:`NEWEST_TESTED`, is probed now.
@@ -226,8 +222,7 @@ def fault(library: Library) -> str:
 
 
 def version_fault(version: tuple[int, ...]) -> str:
-    """Why Dr.Jit cannot use this version on this machine; empty if it can, or if the version is
-    unknown."""
+    """Why Dr.Jit cannot use this version on this machine; empty if it can, or if unknown."""
     if version and version[0] < 15:
         return f"is too old: Dr.Jit needs LLVM {OLDEST} or newer on this machine"
     if version and version[0] < OLDEST:

@@ -29,7 +29,6 @@ def plugin_files(kind: str) -> list[Path]:
 
 
 def decision_names() -> list[str]:
-    """The plugins that Mitsuba treats as samplers and our integrators treat as decisions of the
-    walk."""
+    """The plugins that are samplers to Mitsuba and decisions of the walk to our integrators."""
     files = plugin_files("samplers")
     return [path.stem for path in files if "(DecisionPlugin)" in path.read_text(encoding="utf-8")]

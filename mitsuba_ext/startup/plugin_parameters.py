@@ -1,5 +1,4 @@
-"""The parameters of our plugins, from their pages; the error for a parameter that a plugin does not
-read.
+"""The parameters of our plugins, from their pages; the error for an unread parameter.
 
 Mitsuba also refuses parameters that a plugin did not read, but suggests no name.
 """

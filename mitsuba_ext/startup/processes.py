@@ -10,8 +10,7 @@ import sys
 def python_command(module: str, *arguments: str) -> list[str]:
     """The command that runs a module in another process with the same packages.
 
-    It does not use ``python -m``, which searches the current folder first and may find another copy
-    of this package there.
+    It is not ``python -m``, which may find another copy of this package in the current folder.
 
     Args:
         module: The full name of the module, which is executed as ``__main__``.

@@ -109,8 +109,7 @@ def _execute(module: str) -> None:
 
 
 def _register_refusals(variant: str) -> None:
-    """In a variant that our plugins do not support, registers constructors that raise an error
-    saying so."""
+    """In a variant that our plugins do not support, registers constructors that raise errors."""
     import mitsuba as mi
 
     def refuse(name: str) -> Callable[[mi.Properties], None]:

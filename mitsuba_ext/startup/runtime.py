@@ -77,8 +77,7 @@ def check_version(found: str) -> None:
     """Refuses unsupported versions of Mitsuba.
 
     Args:
-        found: The version, such as ``"3.9.1"``. A pre-release counts as the release that it
-            precedes.
+        found: The version, such as ``"3.9.1"``. A pre-release counts as its release.
 
     Raises:
         InstallationError: The version is unsupported; the message names supported ones.
@@ -116,8 +115,7 @@ def check(variant: str) -> None:
         variant: A name such as ``"llvm_ad_rgb"``. Variants that need no LLVM pass.
 
     Raises:
-        InstallationError: The library does not work; the message says why, and how to get one that
-            does.
+        InstallationError: The library does not work; the message says why, and the remedy.
     """
     if variant.startswith("llvm_"):
         problem = llvm_problem()

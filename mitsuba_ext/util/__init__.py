@@ -1,2 +1,1 @@
-"""Utilities that do not depend on scenes: arrays, files, errors, parameters, point sets, and
-sequences."""
+"""Utilities without scenes: arrays, files, errors, parameters, point sets, and sequences."""

@@ -17,12 +17,10 @@ T = TypeVar("T")
 
 
 def from_numpy(kind: type[T], values: Any) -> T:
-    """Copies ``values``, a NumPy array or something that can be converted to one, to a flat Dr.Jit
-    array.
+    """Copies ``values``, a NumPy array or something convertible to one, to a flat Dr.Jit array.
 
     Dr.Jit itself uses NumPy's memory without a copy, and its kernels depend on whether that memory
-    is aligned. Alignment varies by chance, so about half of all processes and renders would compile
-    separate kernels.
+    is aligned. Alignment varies by chance, so every other render would compile separate kernels.
 
     Parameters:
         kind: The type of the result, such as ``mi.Float``.
@@ -50,8 +48,7 @@ def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = Tr
 
     ``dr.scatter_add`` would do the same. But because several lanes could share an element, Dr.Jit
     gives each thread a copy of any array with fewer than a million numbers, and kernels then
-    contain its size: for arrays with one element per lane, each pass length would compile a
-    separate kernel.
+    contain its size: with one element per lane, each pass length would compile a separate kernel.
     """
     dr.scatter_add(target, value, index, active, dr.ReduceMode.NoConflicts)
 

@@ -98,8 +98,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def beside(path: Path) -> Iterator[Path]:
     """Yields the path of an empty temporary file in the folder of ``path``, which is removed
     afterwards. Also removes temporary files for ``path`` left by processes on this machine that
-    were killed while writing. The name of the temporary file cannot be guessed, so nobody can put a
-    link in its place.
+    were killed while writing. Its name cannot be guessed, so nobody can put a link in its place.
 
     Raises:
         OSError: The file cannot be written; the error names it.

@@ -111,8 +111,7 @@ def blame(folder: Path, process: int, message: str) -> set[Path]:
 
 
 def forgive(folder: Path) -> None:
-    """Removes all marks, so that crashed integrators are tried again. Other files are left alone,
-    whatever their suffix."""
+    """Removes all marks, but no other files, so that crashed integrators are tried again."""
     for suffix in (_RUNNING, _CRASHED):
         for mark in folder.glob(f"*/*{suffix}"):
             if re.search(r"_[0-9a-f]{8}$", mark.stem):

@@ -41,8 +41,7 @@ class Chart:
 def make_charts(
     scene: Record, anchor: str, series_of: Mapping[str, int], target: float | None
 ) -> list[Chart]:
-    """Plots error against samples and against seconds; with a single level, only against
-    seconds."""
+    """Plots error against samples and seconds; with a single level, only against seconds."""
     found = levels(scene)
     axes = [("seconds", "seconds", ())]
     if len(found) > 1:

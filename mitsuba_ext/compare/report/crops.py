@@ -55,8 +55,7 @@ def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
     columns = np.arange(0, width - side + 1, step)
     means = np.stack([_window_means(one, side, rows, columns) for one in logarithms])
     scores = means.var(axis=0) if len(errors) > 1 else means[0]
-    # A stable sort keeps equal scores in reading order, so that the same images give the same
-    # windows
+    # Stable: equal scores stay in reading order, so the same images give the same windows
     order = np.argsort(-scores, axis=None, kind="stable")
     candidates = [
         Window(int(columns[index % len(columns)]), int(rows[index // len(columns)]), side)

@@ -1,5 +1,4 @@
-"""Formats the numbers of the report: three significant digits, a unit, and the interval in that
-unit."""
+"""Formats the report's numbers: three significant digits, a unit, and the interval in that unit."""
 
 from __future__ import annotations
 

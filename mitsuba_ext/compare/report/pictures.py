@@ -1,5 +1,4 @@
-"""The images of a scene for the screen: all with the same exposure, and error maps with the same
-colour scale.
+"""The images of a scene for the screen: all with one exposure, and error maps in one colour scale.
 
 Every image is an 8-bit PNG with the size of the film, as a ``data:`` URI. Scaling or lossy
 compression could be mistaken for errors of the integrator.
@@ -78,8 +77,7 @@ class Pictures:
 
 
 def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
-    """Reads the images of the scene's runs at ``level``; the images of the first round are
-    shown."""
+    """Reads the images of the scene's runs at ``level``; the first round's images are shown."""
     result = Pictures()
     reference = None
     if scene["reference"]:
@@ -149,8 +147,7 @@ def tone_map(pixels: np.ndarray, factor: float) -> np.ndarray:
 def relative_error(pixels: np.ndarray, reference: np.ndarray) -> np.ndarray | None:
     """(I−R)² / (R² + ε) of every pixel, averaged over its channels; ``None`` for a black reference.
 
-    The reference's variance is not subtracted because the difference would be negative in many
-    pixels.
+    The reference's variance is not subtracted: many differences would be negative.
     """
     floor = metrics.RELATIVE_FLOOR * reference.mean() ** 2
     if floor == 0:
@@ -160,8 +157,7 @@ def relative_error(pixels: np.ndarray, reference: np.ndarray) -> np.ndarray | No
 
 def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
     """The limits of a shared logarithmic scale for several error maps. They exclude the smallest 2
-    % and the largest 0.2 % of the pixels, and are rounded outwards to 1, 2 or 5 times a power of
-    ten."""
+    % and largest 0.2 % of pixels, and are rounded outwards to 1, 2 or 5 times a power of ten."""
     if not errors:
         return None
     values = np.concatenate([error[error > 0] for error in errors])
@@ -175,8 +171,7 @@ def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
 def color_indices(error: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """Indices into :func:`color_table`, by the logarithm of the error."""
     low, high = np.log10(limits)
-    # high > low because both are rounded outwards, to different numbers. The maximum avoids
-    # log10(0)
+    # high > low: both are rounded outwards, to different numbers. The maximum avoids log10(0)
     share = (np.log10(np.maximum(error, limits[0])) - low) / (high - low)
     return np.round(np.clip(share, 0, 1) * 255).astype(np.uint8)
 

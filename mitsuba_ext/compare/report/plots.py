@@ -18,8 +18,7 @@ from markupsafe import Markup
 
 from . import formats
 
-#: The marks of the integrators, for matplotlib and as text, so that integrators can be told apart
-#: without colour.
+#: The integrators' marks, for matplotlib and as text, which tell them apart without colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 GLYPHS = ("●", "■", "▲", "◆", "▼", "✚", "✖", "★")
 
@@ -35,8 +34,7 @@ _MIN_SPAN = 2.0
 
 @dataclass(frozen=True)
 class Point:
-    """A level of an integrator: value, and bounds of the interval, which are ``None`` for one
-    run."""
+    """A level of an integrator: value and interval bounds, which are ``None`` for one run."""
 
     x: tuple[float, float | None, float | None]
     y: tuple[float, float | None, float | None]

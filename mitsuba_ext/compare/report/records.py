@@ -1,7 +1,6 @@
 """Reads ``results.json`` for the report, and chooses the runs and the level to show.
 
-A *level* is one size of a run: samples per pixel, or seconds. Integrators are compared only at the
-same level.
+A *level* is the size of a run: samples per pixel, or seconds. Only equal levels are compared.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ from .page import environment, level_name
 from .records import Record
 from .tables import Column
 
-#: The maximum width and height of a thumbnail, in pixels. Its JPEG has about 10 kB, or 30 kB if it
-#: is all noise.
+#: The maximum width and height of a thumbnail. Its JPEG has about 10 kB; 30 kB if it is all noise.
 THUMBNAIL = (160, 120)
 
 #: Headings of the columns that are not ratios.

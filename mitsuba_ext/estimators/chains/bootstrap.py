@@ -83,8 +83,7 @@ class Bootstrap:
             return numbers
         rng = generator(stream(self._seed, _LIGHT), index)
         # Not a literal: recorded kernels (transport/frozen.py) would keep the constant until the
-        # first mutation, and the first render of a scene would differ from the second by rounding
-        # errors
+        # first mutation, and a scene's first two renders would differ by rounding errors
         known = dr.opaque(mi.UInt32, 0, dr.width(index))
         return BothEnds(
             numbers, ProposedNumbers(rng, dr.zeros(mi.UInt32, dr.width(index)), known, light)

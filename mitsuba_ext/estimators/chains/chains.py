@@ -24,8 +24,7 @@ from .target import ImageTarget
 MAX_NUMBERS, MAX_LIGHT_NUMBERS = 128, 96
 
 #: The approximate number of mutations of a launch, over all chains (a second or two on two CPU
-#: cores), and the minimum number per chain. Between launches, states are read and written, and the
-#: clock is checked.
+#: cores), and the minimum number per chain. States and the clock are read in between.
 _LAUNCH, _MIN_LAUNCH = 1 << 21, 16
 
 #: The maximum number of chains in a file.
@@ -96,8 +95,8 @@ class ChainRules:
 
 
 class Chains:
-    r"""Metropolis chains that sample vectors of numbers in proportion to a target function, one
-    chain in each lane.
+    r"""Metropolis chains, one per lane, that sample vectors of numbers in proportion to a target
+    function.
 
     Let :math:`a` be the probability of accepting a proposal. The expected visits are added to the
     image: :math:`a` for the proposal, and :math:`1 - a` for the state. Proposals of large steps are
@@ -159,8 +158,7 @@ class Chains:
 
     @property
     def launch(self) -> int:
-        """The number of mutations of each chain in a launch. The time limit and Ctrl-C are checked
-        between launches."""
+        """The mutations of each chain in a launch. Time limit and Ctrl-C are checked in between."""
         return max(_MIN_LAUNCH, _LAUNCH // self.count)
 
     def stored(self) -> Arrays:
@@ -170,8 +168,7 @@ class Chains:
         return {key: array for part in (own, *parts) for key, array in part.items()}
 
     def _state_kinds(self) -> dict[str, tuple[Any, int | None]]:
-        """The attributes that form the state of all chains, each with its type and its number of
-        lanes."""
+        """The attributes that form the state of all chains, with their types and lanes."""
         rngs = [mi.PCG32] * len(self._rngs)
         return {"_rngs": (rngs, self.count), "_weight": (mi.Float, self.count)}
 
@@ -214,6 +211,6 @@ class Chains:
 
 
 def acceptance(state: mi.Float, proposal: mi.Float) -> mi.Float:
-    """The probability of accepting a proposal, from the values of the target function; 1 if the
-    state has the value 0."""
+    """The probability of accepting a proposal, from the target function's values; 1 if the state's
+    is 0."""
     return dr.select(state > proposal, proposal / state, mi.Float(1))

@@ -62,8 +62,7 @@ class LoopedChains(Chains):
         earlier: mi.Float,
         values: mi.Float,
     ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, MutationCounts]:
-        """Makes ``steps`` mutations of each chain. Overwrites ``values``, the random numbers of the
-        states."""
+        """Makes ``steps`` mutations of each chain. Overwrites ``values``, the states' numbers."""
         count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
         lane = dr.arange(mi.UInt32, self.count)
         rng, known = mi.PCG32(rng), mi.UInt32(known)

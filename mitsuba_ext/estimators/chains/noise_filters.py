@@ -24,8 +24,8 @@ class NoiseFilters:
     Attributes:
         width: The width in pixels of the box that smooths the number of proposals; 0 for no such
             filter.
-        most_consecutive: The maximum number of consecutive visits of a chain to a pixel that are
-            added; 0 for no limit.
+        most_consecutive: The maximum number of a chain's consecutive visits to a pixel to add; 0
+            for no limit.
     """
 
     width: int = 0

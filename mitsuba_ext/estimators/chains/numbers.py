@@ -122,8 +122,7 @@ class StratifiedNumbers:
 
 @dataclass
 class ProposedNumbers:
-    """The random numbers of a proposal: the numbers of the state, moved by small steps, followed by
-    new ones.
+    """The random numbers of a proposal: the state's numbers, moved by small steps, then new ones.
 
     Numbers that the state's path did not draw have no influence on it. A proposal that needs more
     numbers draws new ones, with density 1 in both directions.

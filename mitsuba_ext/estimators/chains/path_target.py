@@ -16,8 +16,7 @@ from .path_space.mutations import Mutations, Proposal
 from .small_steps import SmallSteps
 from .target import Contribution, Found, PlaceWeights, beyond_bound
 
-#: The number of rounds in which the techniques of new paths are learned, and the number of paths
-#: per round.
+#: The number of rounds that learn the techniques of new paths, and of paths per round.
 _ROUNDS, _PATHS = 3, 1 << 15
 
 
@@ -79,8 +78,7 @@ class PathTarget:
     def _evaluated(
         self, numbers: Numbers, active: mi.Bool
     ) -> tuple[Contribution, mi.Float, Sample, Numbers]:
-        """The contribution of a new path, with its luminance; the target function; the state of the
-        numbers."""
+        """A new path's contribution, with its luminance; the target function; ``numbers``."""
         proposal, numbers = self._new_path(copied(numbers), active)
         brought = self._brought(proposal)
         target = beyond_bound(brought.target, self.bound)
@@ -115,7 +113,7 @@ class PathTarget:
         return brought
 
     def _brought(self, proposal: Proposal) -> Contribution:
-        """Like :meth:`contribution`, but with the luminance instead of its part beyond the
+        """Like :meth:`contribution`, but with the luminance, including the part within the
         bound."""
         found = proposal.found
         factor = dr.exp(found.log_geometry - proposal.log_density)

@@ -36,8 +36,7 @@ _MAX_CHAINS = 1 << 17
 #: The maximum numbers of samples and batches in a file.
 _MAX_STORED = {"samples": 1 << 62, "batches": 1 << 31}
 
-#: The index of the random number stream of the first batch; later batches use the following
-#: streams.
+#: The random number stream of the first batch; later batches use the following streams.
 _FIRST_STREAM = 16
 
 
@@ -133,8 +132,7 @@ class RedistributionRender(ChainRender):
             settings.file.save(self._stored(image))
 
     def _stored(self, image: ChainImage) -> Arrays:
-        """The sums over completed batches, which suffice because the next batch takes new
-        samples."""
+        """The sums over completed batches; the next batch takes new samples."""
         tensors = {f"image{n}": np.array(tensor) for n, tensor in enumerate(image.tensors())}
         return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _TOTALS}}
 

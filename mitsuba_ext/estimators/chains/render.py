@@ -22,8 +22,7 @@ from .path_target import PathTarget
 from .stepped import SteppedChains
 from .target import ImageTarget
 
-#: The stream of random numbers of a first stage, different from the streams of the bootstrap and
-#: the chains.
+#: The stream of random numbers of a first stage, not used by the bootstrap and the chains.
 FIRST_STAGE = 5
 
 
@@ -36,8 +35,7 @@ class Stoppable(Protocol):
 
 
 class ChainRender:
-    """A single render. The film must already hold camera samples, to which the light of the chains
-    is added.
+    """A single render. It adds the light of the chains to camera samples that the film must hold.
 
     Parameters:
         integrator: The integrator, which has the time limit and says whether the render was
@@ -86,8 +84,7 @@ class ChainRender:
 
         Parameters:
             width: The number of lanes of a step.
-            act: A function that takes the maximum number of steps to make and returns the number
-                that it made.
+            act: A function of the maximum number of steps that returns the number it made.
 
         Returns:
             False if the render was interrupted or cancelled before the end.

@@ -76,8 +76,7 @@ class SteppedChains(Chains):
             ProposedNumbers(rng, mi.UInt32(none), dr.select(is_large, 0, known), record)
             for rng, known, record in zip(self._rngs, self._known, records)
         ]
-        # Evaluated now because they are used again after the estimator, whose kernels would compute
-        # them a second time
+        # Evaluated now: they are used after the estimator, whose kernels would compute them again
         dr.eval(is_large, threshold, ends)
         found = self._target.evaluate(BothEnds(*ends) if len(ends) == 2 else ends[0])
         self._rngs = [end.rng for end in ends]

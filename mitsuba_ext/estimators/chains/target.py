@@ -127,8 +127,7 @@ class ImageTarget:
         """Does nothing: only the target function of paths learns."""
 
     def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
-        """A contribution. Values that are not finite become black, so that no chain gets stuck
-        there."""
+        """A contribution. Values that are not finite become black, so no chain stays there."""
         target = mi.luminance(dr.abs(value))
         is_sound = dr.isfinite(target)
         if self.weights is not None:

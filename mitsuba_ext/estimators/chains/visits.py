@@ -203,8 +203,7 @@ class MetropolisRender(ChainRender):
 
     def _first_stage(self) -> float:
         """Estimates the mean of the target function, which scales MIS weights. Any scale is
-        unbiased if it does not depend on the samples of the image. Also computes the weights of
-        tiles."""
+        unbiased if it does not depend on the image's samples. Also computes tile weights."""
         settings = self._settings
         seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
         self._target.learn(seed)

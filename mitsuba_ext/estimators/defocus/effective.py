@@ -1,5 +1,4 @@
-"""The effective circle of confusion: the source's approximation to the image of three layers
-through a lens."""
+"""The effective circle of confusion: an approximate image of three layers through a lens."""
 
 from __future__ import annotations
 

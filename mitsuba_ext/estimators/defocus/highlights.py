@@ -120,8 +120,7 @@ class _Pixels:
 
 
 def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Visibility) -> None:
-    """Adds highlights to an image: each to the pixels of its circle of confusion, attenuated by the
-    layers in front of it.
+    """Adds highlights to an image, over their circles of confusion, attenuated by layers in front.
 
     Parameters:
         picture: The RGB of each pixel, row by row.
@@ -135,9 +134,8 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
 
 
 def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
-    """The indices of the highlights to spread, out of the highlights with a radius above 0: if all
-    of them would cover too many pixels, the highlights with the largest brightness per covered
-    pixel."""
+    """The indices of the highlights to spread, out of the highlights with a radius above 0: if
+    these would cover too many pixels, the ones with the largest brightness per covered pixel."""
     covered = math.pi * np.square(radius.numpy())
     order = np.flatnonzero(covered)
     if covered.sum() > _MAX_COVERED * size.count:
@@ -156,8 +154,7 @@ def _spread(picture, position, blur, excess, size, visibility):
     radius = dr.abs(blur)
     reach = mi.Int32(dr.ceil(radius + 0.5))
     side = 2 * reach + 1
-    # Normalize by the sum over pixels, which differs from the area of the disk, so that no light is
-    # lost
+    # Normalize by the sum over pixels, not by the disk's area, so that no light is lost
     i, total = mi.Int32(0), mi.Float(0)
     while i < side * side:
         total += _coverage(mi.Vector2i(i % side, i // side) - reach, radius)

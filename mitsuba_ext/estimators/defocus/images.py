@@ -65,8 +65,7 @@ class Pyramid:
         for level in sizes:
             starts.append(starts[-1] + level.count)
         self.level_count = len(sizes)
-        # Levels are separate arrays at first: Dr.Jit would copy an array that is both read and
-        # written
+        # Levels are separate arrays first: Dr.Jit would copy an array that is read and written
         copies = [data]
         for level in sizes[:-1]:
             copies.append(dr.ravel(halved(mi.Vector4f, copies[-1], level)))

@@ -54,8 +54,8 @@ class LayerBlocks:
 
         Parameters:
             surface: The surface that each sample hit.
-            behind: The blur of a layer: samples are added only to layers behind it; infinity for
-                all layers.
+            behind: Samples are added only to layers behind the layer of this blur; infinity for
+                all.
         """
         known, blur = [], surface.blur
         for k, block in enumerate(self._hits):

@@ -1,5 +1,4 @@
-"""Chooses the pixels of a layered render that take samples of hidden surfaces or of surfaces
-outside the film."""
+"""Chooses the pixels of a layered render that sample hidden surfaces or surfaces off the film."""
 
 from __future__ import annotations
 
@@ -8,8 +7,7 @@ import numpy as np
 #: The edge of a tile, in pixels. Decisions are made for all pixels of a tile together.
 TILE = 8
 
-#: The difference between the blurs of neighbouring pixels, in pixels, above which one surface hides
-#: another there.
+#: The difference between neighbouring pixels' blurs above which one surface hides another.
 _EDGE_STEP = 0.5
 
 
@@ -50,8 +48,7 @@ def _spread(reach: np.ndarray) -> np.ndarray:
 
 def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
     """For each pixel, the smallest blur, which belongs to the farthest surface, at edges near
-    enough for the lens to see this surface behind the pixel; infinity if there is no such edge.
-    Computed by tiles.
+    enough for the lens to see this surface behind the pixel; otherwise infinity. Computed by tiles.
 
     Parameters:
         blurs: Signed blur radii in pixels, [height, width].

@@ -100,8 +100,8 @@ def limits_of(blurs: np.ndarray) -> Limits:
 
 def split(blurs: np.ndarray) -> list[float]:
     """The limit that divides positive blurs into two classes with the smallest variance within them
-    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none if the classes are
-    similar."""
+    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none for similar
+    classes."""
     if blurs.max() < _SPLIT_RATIO * blurs.min():
         return []
     counts, edges = np.histogram(blurs.astype(np.float64), 256)

@@ -16,8 +16,7 @@ from .thin_lens import ThinLens
 #: The null transmission above which surfaces are skipped.
 _MAX_TRANSMITTANCE = 0.5
 
-#: The search for hidden surfaces begins at the depth where the blur is this fraction of the front
-#: surface's blur, or …
+#: The blur, relative to the front surface's, where the search for hidden surfaces begins, or …
 _BEHIND_FRACTION = 0.5
 
 #: … where it is smaller by this number of pixels: the lens sees nothing of surfaces whose blur
@@ -85,8 +84,8 @@ class PinholeView:
         blur is half as large. Behind the focus, it is moved halfway to the blur of the sky.
 
         Returns:
-            The rest of the ray, the surface that it hits, and whether there can be one (nothing is
-            behind the sky).
+            The rest of the ray, the surface that it hits, and whether there can be one (not beyond
+            the sky).
         """
         sky, blur = self._lens.blur_of_sky, first.blur
         start = dr.select(blur > 0, _BEHIND_FRACTION * blur, blur - _BEHIND_FRACTION * (blur - sky))

@@ -27,8 +27,7 @@ _MAX_CELLS = 64
 #: The approximate number of cells in a scene with fewer emitters than this.
 _CELL_BUDGET = 1024
 
-#: The fraction of a voxel by which an edge must exceed a whole number of voxels before it is cut
-#: once more.
+#: The fraction of a voxel by which an edge must exceed a whole number to be cut once more.
 _TOLERANCE = 0.25
 
 #: The maximum second moment of sampling the cells of a textured light by area, relative to sampling
@@ -162,8 +161,7 @@ def _edges(shape: mi.Shape, kind: str) -> np.ndarray:
 
 
 def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
-    """The numbers of cells along two edges, given in voxels [2, 3], such that no cell is longer
-    than a voxel."""
+    """The numbers of cells, no longer than a voxel, along two edges given in voxels [2, 3]."""
     lengths = np.maximum(1, np.linalg.norm(edges, axis=1))
     lengths *= min(1.0, np.sqrt(limit / np.prod(lengths)))
     cuts = np.maximum(1, np.ceil(lengths - _TOLERANCE)).astype(int)
@@ -277,8 +275,7 @@ def _groups(
         return np.zeros(len(middle), int)
     side = sides(normal)
     extent = np.ptp(middle, axis=0) / voxel
-    # Boxes of equal size, initially no longer than a voxel; they grow until there are at most
-    # ``limit`` groups
+    # Boxes of equal size, first no longer than a voxel, grow until there are at most ``limit``
     boxes = np.clip(np.ceil(extent - _TOLERANCE), 1, limit)
     relative = (middle - middle.min(axis=0)) / np.maximum(np.ptp(middle, axis=0), 1e-300)
     while True:

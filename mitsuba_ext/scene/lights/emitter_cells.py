@@ -32,8 +32,8 @@ class EmitterCells:
     """
 
     def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
-        # Kept alive: once the shape of an emitter is freed, the next virtual call to the emitters
-        # of any scene crashes
+        # Kept alive: once an emitter's shape is freed, the next call to any scene's emitters
+        # crashes
         self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
         everything = divide(scene, edges)
@@ -55,8 +55,7 @@ class EmitterCells:
         )
         self._emitter = from_numpy(mi.UInt32, number)
         self._is_divided = any(d.shape for d in divisions)
-        # A textured emitter maps the unit square by its texture, so points of its cells are sampled
-        # on its shape
+        # A textured emitter would sample its texture, so its cells are sampled on its shape
         self._by_area = [
             functools.partial(_sample_by_area, shapes[i], scene.emitters()[i])
             for i, d in zip(indices, divisions) if d.is_textured

@@ -19,8 +19,7 @@ class EnvironmentBins:
 
     Inside a bin, a texel is chosen by its brightness, and a point in it by the bilinear function
     with which Mitsuba's ``envmap`` interpolates. For maps, the density in a bin is therefore
-    proportional to the emission. The sun of a ``sunsky`` is an additional, last bin, cut out of the
-    others.
+    proportional to the emission. The sun of a ``sunsky`` is a last bin, cut out of the others.
 
     Parameters:
         scene: The scene with the environment emitter.
@@ -91,8 +90,7 @@ class EnvironmentBins:
         pdf = density / sin_theta
         if self._sun is not None:
             d = dr.select(in_sun, self._sun.sample(sample), d)
-            # Samples of other bins in the sun's disk get density 0 because they belong to the sun's
-            # bin
+            # Samples of other bins in the sun's disk get density 0: they belong to its bin
             is_lost = ~in_sun & self._sun.contains(d)
             pdf = dr.select(in_sun, 1 / self._sun.solid_angle, dr.select(is_lost, 0, pdf))
         ds = self._texels.directions.sample(ref, d)

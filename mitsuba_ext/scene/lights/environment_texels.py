@@ -15,8 +15,7 @@ from .sun import SunDisk
 #: The disk of the sun is excluded.
 _NODES = (1024, 513)
 
-#: The numbers of columns and rows of nodes of a constant emitter, for which only sin θ is
-#: interpolated.
+#: Columns and rows of nodes of a constant emitter, for which only sin θ is interpolated.
 _CONSTANT_NODES = (64, 33)
 
 #: The number of samples taken with the emitter's own sampling if it has no map.

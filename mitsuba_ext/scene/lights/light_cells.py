@@ -1,5 +1,4 @@
-"""All lights that next event estimation can choose: cells of emitters and bins of an
-environment."""
+"""The lights that next event estimation can choose: cells of emitters, bins of an environment."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Divides the time while a shutter is open into intervals with different positions of moving
-lights."""
+"""Divides the time of an open shutter into intervals, because lights move during it."""
 
 from __future__ import annotations
 

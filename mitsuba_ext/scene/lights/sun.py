@@ -14,8 +14,7 @@ from .spectra import brightness, comparison_wavelengths
 #: Angles at which the edge of the disk is searched for, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)
 
-#: The minimum ratio of the sun's brightness at its edge to the sky's for treating the sun as a
-#: disk.
+#: The minimum brightness of the sun's edge, relative to the sky, for treating it as a disk.
 _CONTRAST = 4.0
 
 #: The ratio of the sampled disk's angle to the sun's: Mitsuba compares cosines with the cosine of
@@ -50,8 +49,7 @@ class SunDisk:
         if emitter.class_name() != "SunskyEmitter" or "sun_direction" not in parameters:
             return None
         sun = dr.normalize(mi.Vector3f(parameters["sun_direction"]))
-        # The edge is searched for upwards: at sunset, the lower half of the disk is below the
-        # horizon
+        # The edge is searched for upwards: at sunset, the lower half is below the horizon
         zenith = emitter.world_transform() @ mi.Vector3f(0, 0, 1)
         upwards = zenith - sun * dr.dot(zenith, sun)
         length = dr.norm(upwards)

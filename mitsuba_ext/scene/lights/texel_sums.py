@@ -65,8 +65,7 @@ class Rectangle:
     Attributes:
         f: The values of a function at the corners.
         sums: The summed-area table of the emission at the corners, relative to the total emission;
-            in double precision, because dark texels beside a sun are small differences of large
-            sums.
+            in double precision: dark texels beside a sun are small differences of large sums.
     """
 
     x0: mi.UInt32
@@ -108,8 +107,7 @@ class TexelSums:
         self._sums = from_numpy(mi.Float64, sums / sums[-1, -1])
         self._nodes = from_numpy(mi.Float, node / node.max())
         self._stride = dr.opaque(mi.UInt32, texels.columns + 1)
-        #: The factor that converts the probability of a texel to a density on the sphere, without 1
-        #: / sin θ.
+        #: The factor from the probability of a texel to a density on the sphere, without 1 / sin θ.
         self._density = dr.opaque(mi.Float, texels.columns * texels.rows / texels.area)
 
     def rectangle(

@@ -19,8 +19,7 @@ from .spectra import brightness, comparison_wavelengths
 #: The minimum weight of a cell, relative to the mean of its row (as in pbrt).
 _FLOOR = 1e-3
 
-#: The minimum and the maximum number of points of a row at which a cell is evaluated. The maximum
-#: for voxels is pbrt's.
+#: The minimum and maximum numbers of a row's points at which a cell is evaluated (voxels: pbrt's).
 _VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
 #: The approximate number of evaluations of all cells in all rows, within these bounds, and again

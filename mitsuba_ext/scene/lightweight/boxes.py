@@ -1,5 +1,4 @@
-"""Boxes as rows of lower and upper corners. Shape (6, …), float32; the corners of empty boxes are
-swapped."""
+"""Boxes as rows of lower and upper corners (swapped in empty boxes). Shape (6, …), float32."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 
 Treelets are heaps. Each of their nodes is split in two twice. The shape of the heap determines the
 counts of both halves; the axis along which the triangles are separated is free. The source takes
-the longest axis. Here, each node takes the axis with the smallest expected cost, from the surface
-areas of the halves.
+the longest axis. Here, it is the axis with the smallest expected cost, by the surface areas of the
+halves.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from .top import Top
 #: The number of triangles that a thread sorts at a time.
 _CHUNK = 1 << 16
 
-#: The number of bits for the number of a treelet's inner nodes; nodes of the top tree have ``TOP``
-#: instead.
+#: The bits for the number of a treelet's inner nodes; nodes of the top tree have ``TOP``.
 INNER_BITS = 5
 TOP = (1 << INNER_BITS) - 1
 

@@ -27,8 +27,7 @@ _SAMPLE = 1024
 #: The number of triangles that a thread splits at a time.
 _CHUNK = 1 << 16
 
-#: The maximum depth of free splits. Below it, parts are split in the middle, which bounds the depth
-#: of the tree.
+#: The maximum depth of free splits. Deeper parts are split in the middle to bound the depth.
 _FREE_ROUNDS = 40
 
 
@@ -99,8 +98,7 @@ def divide(boxes: np.ndarray, order: np.ndarray, pool: Executor) -> TreeletDivis
 
 
 def _groups(size: np.ndarray) -> Iterator[np.ndarray]:
-    """Groups of parts that are split together: each large part alone, others with parts of similar
-    size."""
+    """Groups of parts that are split together: large parts alone, others by similar size."""
     for part in np.flatnonzero(size > _SAMPLE):
         yield np.array([part])
     widths = np.where(size > _SAMPLE, 0, _width(size))

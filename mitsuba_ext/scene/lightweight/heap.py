@@ -63,8 +63,8 @@ class Heap:
         return self.counts[ARITY * level.start + 1 : ARITY * level.stop + 1].reshape(-1, ARITY)
 
     def runs(self, level: range) -> list[NodeRun]:
-        """The nodes of a level in at most three runs: above the bottom row, at its end, and beyond
-        it."""
+        """The nodes of a level in at most three runs: the tree below a node ends on the bottom row,
+        on both of the last rows, or one row above."""
         children = self.of_children(level)
         changes = np.flatnonzero(np.any(children[1:] != children[:-1], axis=1)) + 1
         edges = [0, *changes.tolist(), len(children)]

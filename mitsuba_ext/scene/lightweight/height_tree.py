@@ -18,8 +18,7 @@ from ...util.arrays import from_numpy
 from .slabs import ERROR, with_inverse
 from .traversal import NONE, Hit, traverse
 
-#: The number of bits for x and for y in a node's number, which also holds its depth (0 for the
-#: root).
+#: The bits of x and of y in a node's number, which also holds its depth (0 for the root).
 _BITS = 14
 _MASK, _DEPTH = (1 << _BITS) - 1, 1 << 2 * _BITS
 
@@ -112,8 +111,7 @@ class HeightTree:
     def __init__(self, values: np.ndarray) -> None:
         self.heights = Heights(values)
         self.low, self.high = float(values.min()), float(values.max())
-        # Rounded up so that no number exceeds the largest one; not zero even if all heights are
-        # equal
+        # Rounded up so that no number exceeds the largest one; not zero for equal heights
         unit = max((self.high - self.low) / _RANGE, 1e-30)
         unit = float(np.nextafter(np.float32(unit), np.float32(np.inf)))
         levels, widths = _nodes(*_ranges_of_blocks(values, self.low, unit))
@@ -208,8 +206,7 @@ class _RaysInTree:
         return boxes, lambda c: first | c & 1 | c >> 1 << _BITS
 
     def _sides(self, k: int, node: mi.UInt32, size: mi.Float) -> list[tuple[mi.Float, mi.Float]]:
-        """The distances at which rays enter and leave the first and the second child of a node,
-        along an axis."""
+        """The distances at which rays enter and leave both children of a node along an axis."""
         first, error = 2 * mi.Float(mi.Int32(node)), self._error[k]
         a, b, c = (
             ((first + i) * size - self._rays.o[k]) * self._rays.inverse[k] for i in range(3)
@@ -301,8 +298,7 @@ class _Block:
         return dr.select(is_hit, new, t), dr.select(is_hit, index, triangle)
 
     def _piece(self, column: int, row: int) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-        """The distances at which a ray enters and leaves a cell, and its heights above the surface
-        there."""
+        """The distances where a ray enters and leaves a cell, and its heights above the surface."""
         ends = []
         for lines, k, edge, d in (
             (self._at_x, column, row, self._rays.d.x), (self._at_y, row, column, self._rays.d.y)
@@ -322,13 +318,11 @@ class _Block:
         )  # fmt: skip
 
     def _crossing(self, o, slopes, start: mi.Float, end: mi.Float) -> mi.Float:
-        """The distance at which a ray meets a plane through the vertex 00; ``o`` is relative to
-        this vertex."""
+        """The distance of a plane through the vertex 00, relative to which ``o`` is given."""
         d = self._rays.d
         above = dr.fma(-slopes[0], o[0], dr.fma(-slopes[1], o[1], o[2]))
         change = dr.fma(-slopes[0], d.x, dr.fma(-slopes[1], d.y, d.z))
-        # For a ray in the plane, the quotient may be anything, even NaN, which these functions
-        # discard
+        # For a ray in the plane, the quotient may even be NaN, which these functions discard
         return dr.fmin(dr.fmax(-above / change, start), end)
 
 
@@ -351,8 +345,7 @@ def _ranges_of_blocks(
 
 
 def _unions(union: np.ufunc, values: np.ndarray) -> np.ndarray:
-    """The union of rows 0 to 2, of rows 2 to 4, and so on; the last union may have only two
-    rows."""
+    """The union of rows 0 to 2, of rows 2 to 4, and so on; the last may be of two rows."""
     result = union(values[:-1:2], values[1::2])
     last = values[2::2]
     union(result[: len(last)], last, out=result[: len(last)])

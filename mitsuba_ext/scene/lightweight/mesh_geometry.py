@@ -47,8 +47,7 @@ def sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndar
             values = parameters[key].numpy().reshape(len(faces), -1)
             parameters[key] = from_numpy(mi.Float, values[order])
     parameters["faces"] = from_numpy(mi.UInt32, faces[order])
-    # Reported as changed vertices: Mitsuba then recomputes the areas of a light's triangles, and
-    # keeps existing normals
+    # As if vertices had changed: Mitsuba then recomputes the areas of a light, and keeps normals
     for key in ("vertex_positions", "vertex_normals"):
         parameters.set_dirty(key)
     parameters.update()

@@ -10,8 +10,7 @@ import drjit as dr
 #: whose difference it is.
 ERROR = 2.0**-21
 
-#: The minimum absolute value of components of directions: smaller ones are replaced, so that their
-#: inverse is finite.
+#: The minimum absolute value of a direction's components, so that their inverses are finite.
 _TINY = 1e-18
 
 D = TypeVar("D")

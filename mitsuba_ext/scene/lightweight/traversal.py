@@ -1,5 +1,4 @@
-"""Traverses a tree: visits nearer children first and keeps the others on a stack (Cline 2007,
-section 3.3.4)."""
+"""Traverses a tree: nearer children first, the others on a stack (Cline 2007, section 3.3.4)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Intersects rays with triangles such that no ray passes between two triangles that share an edge
-or a corner.
+"""Intersects rays with triangles; no ray passes between two that share an edge or a corner.
 
 Corners are projected along the ray. The signs of three areas tell whether the projected triangle
 contains the ray. Triangles that share an edge compute its area from the same two points of the

@@ -9,8 +9,7 @@ import numpy as np
 from ..solid_angles.disk import EllipticalCone, elliptical_cone
 from .surface import Surface, SurfacePoint
 
-#: The tolerance for a disk with equally long, perpendicular axes, as a fraction of their squared
-#: length.
+#: The tolerance for equally long, perpendicular axes, as a fraction of their squared length.
 _TOLERANCE = 1e-4
 
 

@@ -10,8 +10,7 @@ from ...util.arrays import from_numpy
 from ..solid_angles.spherical_triangle import SphericalTriangle, spherical_triangle
 from .surface import Surface, SurfacePoint
 
-#: The maximum number of triangles of a mesh that is sampled by solid angle: each sample visits all
-#: triangles.
+#: The maximum number of triangles for sampling by solid angle: each sample visits all of them.
 MAX_TRIANGLES = 16
 
 #: The number of floats per triangle in the table: a corner, two edges, a sign, and three normals.

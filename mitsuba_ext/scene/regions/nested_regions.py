@@ -11,8 +11,7 @@ from ...util.stored_arrays import StoredArrays
 from .surface_sides import region
 from .voxel_sides import SIDES, VoxelSides, voxel_coordinates
 
-#: The number of voxels along each axis at each level. Voxels divide the voxels of the previous
-#: level.
+#: The number of voxels along each axis at each level; they divide the previous level's voxels.
 _GRIDS = (4, 8, 16, 32)
 
 

@@ -38,8 +38,7 @@ class VoxelGrid:
         if not bbox.valid():
             raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min
-        # Gives the voxels of a flat scene some depth, and keeps points off the outer faces of the
-        # grid
+        # Gives a flat scene's voxels some depth, and keeps points off the grid's outer faces
         padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)
@@ -87,9 +86,8 @@ class VoxelGrid:
         _mark(is_occupied, dr.opaque(mi.Int32, self.resolution), first, last, a, normal, inside)
 
     def _mark_boxes(self, is_occupied: mi.UInt32, boxes: list[mi.ScalarBoundingBox3f]) -> None:
-        """Shapes that are not meshes occupy their bounding boxes. One launch handles all boxes,
-        with a lane for each layer of each box, so that corners are data instead of literals in a
-        kernel."""
+        """Shapes that are not meshes occupy their bounding boxes. One launch handles all boxes, a
+        lane for each layer of each box: corners are data, not literals of a kernel."""
         if not boxes:
             return
         low, high = (

@@ -30,8 +30,8 @@ class Cone:
 
     def sample(self, sample: mi.Point2f) -> mi.Vector3f:
         """Samples a direction uniformly in the cone. Returns the unit vector from the centre of the
-        sphere to the point seen in this direction. The concentric map from square to disk makes the
-        map continuous."""
+        sphere to the point seen in this direction. The concentric map of the disk makes it
+        continuous."""
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         # 1 - cos θ is uniform; sin²θ = (1 - cos θ) (1 + cos θ) is exact for small cones
         r_2 = dr.minimum(dr.squared_norm(disk), 1)

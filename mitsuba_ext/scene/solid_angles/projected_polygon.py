@@ -1,5 +1,4 @@
-"""Convex polygons, sampled by projected solid angle: in proportion to the cosine with a receiver's
-normal.
+"""Convex polygons, sampled in proportion to the cosine with a receiver's normal.
 
 The Nusselt analog: the polygon's part of the unit sphere, projected on the plane of the receiver,
 is a region of the unit disk. Projected solid angle sampling chooses a uniform point of this region
@@ -138,8 +137,7 @@ class _Arc:
         end: Its end with the lower azimuth.
         across: Vector in its plane, perpendicular to ``end``, towards the other end.
         normal: Normal of its plane, with a positive z.
-        weight: ± the z component of the normal: positive for edges far from the pole, negative for
-            near edges.
+        weight: ± the z component of the normal: + for edges far from the pole, − for near ones.
     """
 
     low: mi.Float

@@ -3,8 +3,7 @@
 The map is from J. Arvo, *Stratified Sampling of Spherical Triangles*, 1995 (course, 4.3), in the
 form of C. Peters, *BRDF Importance Sampling for Polygonal Lights*, 2021, which needs no angles of
 the triangle. Instead of subtracting almost equal numbers as in these papers, differences are
-computed from the edges of the triangle. The map is therefore exact for arbitrarily small and
-distant triangles.
+computed from the edges of the triangle. The map is therefore exact for tiny and distant triangles.
 """
 
 from __future__ import annotations

@@ -63,8 +63,7 @@ def piecewise_weights(
 ) -> FloatArray:
     """Weights of independent points of a piecewise constant density, computed in each piece
     separately. A piece may have no point by chance. Its weights are therefore divided by the
-    probability that it has at least one: sums are unbiased if sums with the weights of ``weigher``
-    are.
+    probability that it has at least one: sums are unbiased if sums by ``weigher`` are.
 
     Parameters:
         x: Points in [0, 1], of shape (N,).

@@ -21,8 +21,7 @@ BOUNDARIES = ("clip", "torus")
 #: distinguish them from their mirror images.
 _BORDER = 1e-7
 
-#: The distance, by dimension, below which points are treated as equal: Qhull cannot distinguish
-#: them.
+#: The distance, by dimension, below which points count as equal: Qhull cannot distinguish them.
 _SPACING = {2: 1e-10, 3: 1e-7}
 
 #: The maximum errors of the sum of all cells: with only the images near the domain (a missing image

@@ -23,8 +23,8 @@ def log_density(
     active: mi.Bool,
     techniques: Techniques | None = None,
 ) -> mi.Float:
-    """The logarithm of the density of making the vertices between ``keeps`` and ``rest``, summed
-    over all techniques.
+    """The logarithm of the density, over all techniques, of the vertices between ``keeps`` and
+    ``rest``.
 
     Parameters:
         keeps, rest: As in :class:`~mitsuba_ext.estimators.chains.path_space.plan.Plan`.
@@ -71,8 +71,8 @@ def _from_light(memory: PathMemory, path: Head, index: mi.UInt32) -> mi.Float:
 
 
 def _joins(space, memory, path, index, can_be_hit) -> mi.Bool:
-    """Whether the vertex ``index``, made from the light, can be connected to the previous vertex,
-    made from the camera."""
+    """Whether vertex ``index``, made from the light, can be connected to the one made from the
+    camera before it."""
     sees = mi.Bool(space.connectable is not None) & (path.length > 1)
     before = dr.select(index == 1, sees, memory.places[path.at + index - 1].is_discrete == 0)
     here = (index == path.length) | (memory.places[path.at + index].is_discrete == 0)

@@ -23,9 +23,8 @@ from .space import PathSpace, towards, turned
 NO_LIGHT = 0xFFFFFFFF
 
 #: The maximum squared difference between the direction of a delta lobe and the direction to the
-#: next vertex. A larger one means that the path took another lobe. The difference is not 0 because
-#: rays start at an offset from the surface, so the direction to a near vertex is not exactly the
-#: mirror direction.
+#: next vertex. A larger one means that the path took another lobe. It is not 0 because rays start
+#: at an offset from the surface.
 _MAX_MISS = 0.1
 
 
@@ -90,8 +89,7 @@ def trace_from_camera(
     light_weight = mi.Spectrum(1)
     scatter, shadow = mi.UInt32(0), mi.UInt32(0)
     is_found = mi.Bool(False)
-    # Whether the path has passed only through null surfaces. If lights are hidden, it then does not
-    # see the sky
+    # Whether the path has passed only null surfaces. If lights are hidden, it does not see the sky
     is_straight = mi.Bool(True)
     while dr.hint(active, label="path"):
         si = query.interaction(pi, ray)
@@ -251,7 +249,7 @@ def _light(space: PathSpace, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi
 def _lobe_ratio(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
     """The logarithm of the ratio of solid angles behind and before a delta lobe: the factor by
     which a density of directions changes for the reverse direction through the lobe. It is 0 except
-    for refraction, where ``η² cos θ dω`` is the same on both sides. The lobe may have a separate
+    for refraction, where ``η² cos θ dω`` is the same on both sides. The lobe may have its own
     normal."""
     refracts = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
     n = si.wi + bs.eta * bs.wo

@@ -12,8 +12,7 @@ from .plan import Plan
 from .space import PathSpace, turned
 
 #: The minimum and the maximum angle, in radians, by which perturbations turn directions. For light
-#: from infinity: the minimum and the maximum displacement of the ray, in units of the scene's
-#: radius.
+#: from infinity: the displacement of the ray, in units of the scene's radius.
 LOW, HIGH = 1e-4, 0.1
 
 

@@ -93,8 +93,7 @@ def light_start_densities(
         scene, emitter, d, n, ref, active, knows_normal=True
     )
     chance = emission.chance(index, active)
-    # For beams and lights at infinity, the density of the last vertex is the density of the
-    # direction
+    # For beams and lights at infinity, the direction's density is the last vertex's density
     by_direction = kinds.is_infinite(index, active) | kinds.is_beam(index, active)
     return (
         dr.select(by_direction, chance * direction, position),

@@ -34,17 +34,15 @@ class Logs:
     """Natural logarithms of densities at a vertex; −∞ for 0.
 
     The density of a vertex per area (for a light at infinity: per solid angle) is the density of a
-    direction at its neighbour times a geometric factor. If a delta lobe chose the direction, the
-    density of the direction counts as 1, and the geometric factor is such that both ways through
-    the lobe agree.
+    direction at its neighbour times a geometric factor. If a delta lobe chose the direction, its
+    density counts as 1, and the geometric factor is such that both ways through the lobe agree.
 
     Attributes:
         from_camera, from_light: The geometric factors, for the neighbours on either side. At the
             first vertex, ``from_camera`` is the density of a uniform position on the film; at the
             last vertex, ``from_light`` is the density with which light paths begin there.
         to_light, to_camera: The densities per solid angle of the directions to the neighbours. At
-            the last vertex, ``to_camera`` is the factor that emission contributes to the density of
-            the previous vertex.
+            the last vertex, ``to_camera`` is the factor of emission in the density before it.
     """
 
     from_camera: mi.Float

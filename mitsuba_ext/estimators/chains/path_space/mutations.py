@@ -23,8 +23,7 @@ NEW_PATH, BIDIRECTIONAL, FROM_CAMERA, FROM_LIGHT = 0, 1, 2, 3
 #: maximum in units of the film's width.
 _MIN_PIXELS, _MAX_WIDTHS = 0.1, 0.1
 
-#: Numbers whose multiples, modulo one, form a low-discrepancy sequence in the unit square (M.
-#: Roberts, 2018).
+#: Their multiples, modulo one, are a low-discrepancy sequence in the square (M. Roberts, 2018).
 _LATTICE = (0.7548776662466927, 0.5698402909980532)
 
 

@@ -16,9 +16,8 @@ class Plan:
         grown: The last vertex made from the camera.
         rest: The first vertex kept at the light's end; length + 1 if none is kept. The
             vertices between ``grown`` and ``rest`` are made from the light.
-        perturbs: Whether the new vertices follow the old path at a small distance. Otherwise, they
-            are sampled by a random walk. At delta lobes, the new path takes the same lobe as the
-            old one.
+        perturbs: Whether the new vertices follow the old path at a small distance. Otherwise, a
+            random walk samples them. At delta lobes, the new path takes the old path's lobe.
     """
 
     keeps: mi.UInt32

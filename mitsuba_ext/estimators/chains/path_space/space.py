@@ -101,15 +101,13 @@ class PathSpace:
 
 
 def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
-    """The direction from ``p`` to a vertex. The vertex of a light at infinity is itself a direction
-    (``is_direction``)."""
+    """The direction from ``p`` to a vertex, which is itself a direction for a light at infinity."""
     return dr.select(is_direction, mi.Vector3f(place.p), dr.normalize(place.p - p))
 
 
 def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
     """A direction at an angle to ``d`` between ``low`` and ``high``. The logarithm of the angle is
-    uniformly distributed. The density depends only on the angle, so the reverse perturbation has
-    the same density.
+    uniformly distributed. The density depends only on the angle, so the reverse has it too.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3; D. Cline,
     PhD thesis, 2007, Fig. 7.26.

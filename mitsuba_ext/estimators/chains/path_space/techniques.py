@@ -1,5 +1,4 @@
-"""The techniques that make new paths: the path length, and the number of vertices from either
-end."""
+"""The techniques that make new paths: the length, and the number of vertices from either end."""
 
 from __future__ import annotations
 
