@@ -24,7 +24,7 @@ from .target import ImageTarget
 MAX_NUMBERS, MAX_LIGHT_NUMBERS = 128, 96
 
 #: The approximate number of mutations of a launch, over all chains (a second or two on two CPU
-#: cores), and the minimum number per chain. States and the clock are read in between.
+#: cores), and the minimum number per chain. States are stored and the clock is checked in between.
 _LAUNCH, _MIN_LAUNCH = 1 << 21, 16
 
 #: The maximum number of chains in a file.

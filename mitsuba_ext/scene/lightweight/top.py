@@ -47,8 +47,7 @@ class Top:
 
 
 def _children(division: TreeletDivision, areas: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """The halves of each part, of which the largest is split twice if possible. Shape (parts,
-    4)."""
+    """Shape (parts, 4): the halves of each part; twice, the largest that can be split is split."""
     children = np.full((len(parts), ARITY), -1)
     children[:, 0], children[:, 1] = division.left[parts], division.left[parts] + 1
     rows = np.arange(len(parts))

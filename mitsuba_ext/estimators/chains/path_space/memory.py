@@ -42,7 +42,8 @@ class Logs:
             first vertex, ``from_camera`` is the density of a uniform position on the film; at the
             last vertex, ``from_light`` is the density with which light paths begin there.
         to_light, to_camera: The densities per solid angle of the directions to the neighbours. At
-            the last vertex, ``to_camera`` is the factor of emission in the density before it.
+            the last vertex, ``to_camera`` is the factor that emission contributes to the previous
+            vertex's density.
     """
 
     from_camera: mi.Float

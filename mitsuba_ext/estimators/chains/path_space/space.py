@@ -107,7 +107,8 @@ def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
 
 def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
     """A direction at an angle to ``d`` between ``low`` and ``high``. The logarithm of the angle is
-    uniformly distributed. The density depends only on the angle, so the reverse has it too.
+    uniformly distributed. The density depends only on the angle, so the reverse perturbation has
+    the same density.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3; D. Cline,
     PhD thesis, 2007, Fig. 7.26.
