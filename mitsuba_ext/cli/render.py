@@ -47,7 +47,7 @@ from .frames import FrameRange, Sensors, pictures
 @click.option(
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
     help="Take as many samples as fit into S seconds of rendering. The first samples measure the "
-    "speed, with Mitsuba's integrators and with those of ours that learn (whose kernels are then "
+    "speed, with Mitsuba's integrators and with ours that learn (whose kernels are then "
     "compiled within S). With others, and with structured samplers, a few short renders measure "
     "it, which takes additional time.",
 )
@@ -69,8 +69,8 @@ from .frames import FrameRange, Sensors, pictures
 @click.option(
     "--parameters", metavar="FILE.py:FUNCTION", shell_complete=candidates.modules,
     help="With --frames: a Python function of the frame's number that returns a dict of the "
-    "frame's parameters. Keys with a dot are those of mi.traverse, which are set without loading "
-    "the scene again; others are $KEY parameters of the scene file.",
+    "frame's parameters. Keys with a dot are keys of mi.traverse, set without loading the scene "
+    "again; others are $KEY parameters of the scene file.",
 )
 @click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR", shell_complete=candidates.folders,

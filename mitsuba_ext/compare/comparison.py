@@ -1,5 +1,5 @@
-"""Compares several integrators on several scenes: references, runs, ``results.json`` and report in
-one folder. A comparison that is started again in its folder renders only what is missing."""
+"""Compares several integrators on several scenes, with references, runs, ``results.json`` and
+report in one folder. A comparison restarted in its folder renders only what is missing."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ if TYPE_CHECKING:
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
-#: Samples of a reference, as a multiple of those of the longest run.
+#: The samples of a reference, as a multiple of the samples of the longest run.
 _REFERENCE_FACTOR = 16
 
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """A scene of a comparison, with the settings that apply to it alone.
+    """A scene of a comparison, with settings for this scene only.
 
     Attributes:
-        source: An XML file, or a dict as ``mi.load_dict`` takes it. Its integrator is replaced.
-        size: Width and height that replace those of the film.
+        source: An XML file, or a dict for ``mi.load_dict``. Its integrator is replaced.
+        size: Width and height that replace the film's.
         parameters: Values for the ``$name`` placeholders of the file.
-        reference: The file of its reference. Default: render a reference.
-        changes: What else replaces something of the scene.
+        reference: The file of its reference. By default, a reference is rendered.
+        changes: Other changes to the scene.
     """
 
     source: SceneSource
@@ -67,30 +67,30 @@ class Comparison:
     """Compares integrators on scenes.
 
     Args:
-        scenes: XML files, dicts, or :class:`SceneSetup` of them.
+        scenes: XML files, dicts, or :class:`SceneSetup` objects of these.
         integrators: Specifications (:func:`mitsuba_ext.inputs.specifications.make_named`), or a
             mapping of labels to them. Ratios are given relative to the first.
-        budget: Samples, seconds or error of each run: see :mod:`.budgets`.
-        seeds: Runs of each integrator at each level.
-        folder: For ``results.json``, ``report.html``, images and references; made if missing. Runs
-            and references that it holds are used again. Default: a temporary folder, which is
+        budget: The samples, seconds or error of each run; see :mod:`.budgets`.
+        seeds: The number of runs of each integrator at each level.
+        folder: The folder for ``results.json``, ``report.html``, images and references; made if
+            missing. Stored runs and references are reused. By default, a temporary folder that is
             deleted with the object.
-        reference_spp: Samples per pixel of rendered references. Default: 16 times those of the
-            longest run. With a time budget: as many as take 16 times that long. With ``until``:
+        reference_spp: Samples per pixel of rendered references. By default, 16 times the samples of
+            the longest run; with a time budget, as many as take 16 times as long; with ``until``,
             enough for a relMSE of 1/16 of the target.
-        reference_integrator: The integrator that renders references. Default: ``path``, unless it
-            does not see everything in the scene (:mod:`.reference_choice`).
-        reference_workers: The workers that render references. Default: this process. Measured runs
-            are rendered in this process, one at a time, because times on other machines or shared
-            cores cannot be compared.
+        reference_integrator: The integrator that renders references. By default, ``path``, unless
+            it cannot render everything in the scene (:mod:`.reference_choice`).
+        reference_workers: The workers that render references. By default, this process. Measured
+            runs are rendered in this process, one at a time, because times on other machines or
+            shared cores are not comparable.
         command: The command line, for the report.
-        only_stored: Render nothing; make figures and report from the runs in the folder.
+        only_stored: Whether to render nothing, and make figures and report from the stored runs.
         with_reference: ``False`` needs no reference: errors are the variance between the seeds,
             which does not contain bias.
         cpu_time: Measure the CPU time of all threads, which other programs on the machine hardly
             change, instead of the wall clock.
-        warn: Called with each remark about a scene, its reference and its stored runs as soon as it
-            is known; the results hold them too.
+        warn: A function that is called with each remark about a scene, its reference and its stored
+            runs as soon as it is known; the results also hold the remarks.
 
     Raises:
         InputError: No scene was given, an integrator cannot be made, ``budget`` is no
@@ -164,14 +164,14 @@ class Comparison:
     def run(self, progress: bool | Callable[[Step], None] = True) -> Results:
         """Measures everything, writes ``results.json`` and ``report.html``, returns the results.
 
-        After Ctrl-C, it writes both files from the finished runs, then raises the exception again.
+        After Ctrl-C, it writes both files from the finished runs and raises the exception again.
 
         Args:
-            progress: ``True`` shows a bar on a terminal, and elsewhere writes a line to stderr
+            progress: ``True`` shows a bar on a terminal, and otherwise writes a line to stderr
                 every half minute; ``False`` shows nothing; a function is called before each step.
 
         Raises:
-            InputError: The only scene, or its reference, cannot be used (with several scenes, the
+            InputError: The only scene or its reference cannot be used (with several scenes, the
                 results record the error instead); another comparison is running in the folder; or
                 the folder cannot be made.
         """
@@ -217,7 +217,7 @@ class Comparison:
         return Results(results.clean(content), self.folder)
 
     def _repr_html_(self) -> str | None:
-        """For notebooks: what has been measured; ``None`` before that."""
+        """For notebooks: the results, or ``None`` before the first measurement."""
         return self.results()._repr_html_() if self._records else None
 
     def write(self) -> None:
@@ -264,13 +264,13 @@ class Comparison:
         return reference
 
     def _remark_on_file(self, experiment: Experiment, reference: Reference) -> None:
-        """Remarks on a reference that the user gives."""
+        """Adds remarks on a reference file given by the user."""
         if reference.fault not in ("", image_files.NO_CHECKSUM):
             experiment.remark(f"{reference.path}: {reference.fault}: it was damaged, or edited")
-        # Its name only, as parameters can name files
+        # Its name only, because parameters can name files
         name = str(reference.metadata.get("integrator", "")).partition(":")[0]
         if name.isidentifier():
-            with contextlib.suppress(InputError):  # a plugin that is not here
+            with contextlib.suppress(InputError):  # a plugin that is not installed
                 self._remark_on_integrator(experiment, make_named(name))
 
     def _remark_on_integrator(self, experiment: Experiment, named: NamedIntegrator) -> None:
@@ -308,8 +308,8 @@ class Comparison:
             folder,
             integrator,
             lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
-            # A derived number varies with the measured speed or noise: accept a stored reference
-            # with half as many samples
+            # A derived number varies with the measured speed or noise, so a stored reference with
+            # half as many samples is accepted
             enough=asked or spp // 2,
             workers=self._reference_workers,
             warn=experiment.remark,

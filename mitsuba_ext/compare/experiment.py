@@ -2,18 +2,17 @@
 
 - Errors are measured against a reference, or, without one, between the seeds of each integrator.
 
-- Every integrator gets the settings of the scene's own (``max_depth``, ``rr_depth``,
+- Every integrator gets the settings of the scene's own integrator (``max_depth``, ``rr_depth``,
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
-- Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
-  (for a size of pass that the small renders did not have) is discarded and repeated.
+- Small renders compile the kernels beforehand. A measured run that still compiled a kernel (for a
+  pass size that did not occur in the small renders) is discarded and repeated.
 - With a time budget, integrators that learn plan for it (``timing.plans_for_time``). For others,
   the number of samples is computed from their speed.
-- The integrators take turns (A B C A B C …), round by round, so that a machine that slows down
-  affects all of them. Each round and each level has its own seed, which the integrators share.
-- Times are compared within one session only. A stored run of an earlier session is timed again (its
+- The integrators take turns (A B C A B C …), round by round, so that a slowdown of the machine
+  affects all of them. Each round and each level has a separate seed, which the integrators share.
+- Times are compared only within one session. A stored run of an earlier session is timed again (its
   image is kept) when a run of this session is compared with it.
-- The measured time covers the whole of ``render()``, learning included, until the image is in
-  memory.
+- The measured time covers all of ``render()``, including learning, until the image is in memory.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
 
-#: With a time budget, a run that misses its time by more than this fraction is repeated with a
-#: corrected number of samples, up to this number of attempts in all.
+#: With a time budget, the maximum relative deviation of a run's time, and the maximum number of
+#: attempts: a run that misses its time is repeated with a corrected number of samples.
 TIME_TOLERANCE = 0.05
 _TIME_ATTEMPTS = 3
 
-#: Most samples per pixel of ``until`` if the file of the reference does not give its own number.
+#: The maximum samples per pixel of ``until`` if the reference's file does not give its own.
 _MAX_UNTIL_SPP = 1 << 16
 
 
@@ -51,18 +50,18 @@ class Experiment:
     """Renders one scene with several integrators and measures them.
 
     Args:
-        scene: The scene. Of its own integrator, only the settings are used.
+        scene: The scene. Only the settings of its own integrator are used.
         integrators: Specifications (:func:`mitsuba_ext.inputs.specifications.make_named`), or a
-            mapping of labels to them. Figures are given relative to the first.
-        budget: Samples, seconds or error of each run.
-        rounds: Runs of each integrator at each level.
-        folder: Stores the runs; those that it already holds are not rendered again.
-        only_stored: Use the stored runs only, and render nothing.
+            mapping of labels to them. Ratios are relative to the first.
+        budget: The samples, seconds or error of each run.
+        rounds: The number of runs of each integrator at each level.
+        folder: The folder that stores the runs; stored runs are not rendered again.
+        only_stored: Whether to use only the stored runs and render nothing.
         cpu_time: Measure the CPU time of all threads, not the wall clock.
-        warn: Called with each sentence that is added to :attr:`remarks`.
+        warn: A function that is called with each sentence added to :attr:`remarks`.
 
     Attributes:
-        remarks: Sentences about the scene, its reference and the folder.
+        remarks: Remarks about the scene, its reference and the folder.
 
     Raises:
         InputError: An integrator is unknown, rejects a parameter, or is given twice.
@@ -111,19 +110,19 @@ class Experiment:
                 warn(remark)
 
     def remark(self, sentence: str) -> None:
-        """Adds to :attr:`remarks`."""
+        """Adds a sentence to :attr:`remarks`."""
         self.remarks.append(sentence)
         self._warn(sentence)
 
     def run(
         self, reference: Reference | None, progress: Callable[[Step], None] = lambda _step: None
     ) -> None:
-        """Measures everything. The results are in :attr:`contenders`, also after an interruption.
+        """Measures everything. The results are in :attr:`contenders`, even after an interruption.
 
         Args:
             reference: The image against which errors are measured; ``None`` to measure them between
                 the seeds.
-            progress: Called before each run.
+            progress: A function that is called before each run.
         """
         self.reference = reference
         self._progress = progress
@@ -170,14 +169,14 @@ class Experiment:
             )
 
     def _is_done(self, contender: Contender, index: int) -> bool:
-        """Is the error reached? Also true without runs, which happens with ``only_stored``."""
+        """Whether the error is reached. Also true without runs (with ``only_stored``)."""
         runs = contender.at(self.budget.level(index))
         return not runs or _mean_error(runs) <= self.budget.target
 
     # ---- One run ----
 
     def _attempt(self, contender: Contender, action: Callable[[], object]) -> None:
-        """Calls ``action`` and records an error of the integrator, so that the others go on."""
+        """Calls ``action`` and records an error of the integrator, so that the others continue."""
         try:
             action()
         except (Exception, SystemExit) as error:  # an integrator may raise anything
@@ -234,7 +233,7 @@ class Experiment:
         self._progress(Step(label, self._done, self._seconds_left()))
         with marked(self._mark(contender)):
             timed = self._render_compiled(contender, run.level, run.spp, run.seed)
-        # Where the integrator plans for the time, it took another number of samples in that time
+        # If the integrator plans for the time, it took a different number of samples in that time
         self._folder.add_time(run, timed.seconds * run.spp / timed.spp)
         self._done += timed.seconds
 
@@ -287,8 +286,8 @@ class Experiment:
     def _render_compiled(
         self, contender: Contender, level: float, spp: int, seed: int
     ) -> timing.Timed:
-        """Renders ``spp`` samples; for the ``level`` of a time budget, if the integrator plans for
-        it."""
+        """Renders ``spp`` samples; with a time budget, renders for the time ``level`` if the
+        integrator plans for it."""
         timed = self._timed(contender, level, spp, seed)
         return self._timed(contender, level, spp, seed) if timed.compiled else timed
 
@@ -305,7 +304,7 @@ class Experiment:
         integrator = contender.named.integrator
         counts = () if self.budget.is_time else self._counts()
         # One sample per pixel, powers of two and other counts have different kernels (Mitsuba
-        # divides the index of a sample by the count): compile each kind that occurs.
+        # divides the index of a sample by the count): compile each kind that occurs
         kinds = sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts})
         for spp in kinds:
             self._timed(contender, 0, spp, seed=0)
@@ -338,7 +337,7 @@ class Experiment:
     # ---- Numbers ----
 
     def _counts(self) -> list[int]:
-        """Samples per pixel of the levels that are known beforehand."""
+        """The samples per pixel of the levels that are known beforehand."""
         if self.budget.kind == "until":
             return [int(self.budget.level(0))]
         return [int(value) for value in self.budget.values]
@@ -347,7 +346,7 @@ class Experiment:
         return max(1, round(level / contender._pace)) if self.budget.is_time else int(level)
 
     def _seconds_left(self) -> float | None:
-        """Estimated seconds of the missing runs; ``None`` for ``until``."""
+        """The estimated time of the missing runs, in seconds; ``None`` for ``until``."""
         if self.budget.kind == "until":
             return None
         left = 0.0
@@ -374,9 +373,9 @@ class Experiment:
 
 
 def run_seed(index: int, round: int) -> int:
-    """The seed of a run of the ``index``-th level. It is a hash, because Mitsuba's stratified
-    samplers at seed s + ``spp`` give a pixel the strata that its neighbour has at seed s. It has
-    31 bits, so that it fits into an integer attribute of an EXR."""
+    """The seed of a run of the ``index``-th level. It is a hash because, at seed s + ``spp``,
+    Mitsuba's stratified samplers give a pixel the strata of its neighbour at seed s. It has 31
+    bits, to fit into an integer attribute of an EXR."""
     return zlib.crc32(f"level {index}, round {round}".encode()) >> 1
 
 

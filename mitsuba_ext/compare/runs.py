@@ -1,9 +1,9 @@
 """Measured renders, and the folder that stores them.
 
 Every run is one EXR: its image, and a header with its cost. The file name contains a hash of
-everything that the run depends on: a comparison that is started again uses the stored runs, but
-never runs of another scene, integrator, version or machine, nor files that are damaged or renamed:
-they hold their name, and a checksum. A run that was timed again in another session has a JSON file
+everything on which the run depends, so a restarted comparison uses the stored runs, but never runs
+of another scene, integrator, version or machine. Files also hold their name and a checksum, so
+damaged or renamed files are not used. A run that was timed again in another session has a JSON file
 with these times beside it.
 """
 
@@ -23,7 +23,7 @@ from ..util import marks
 from ..util.errors import InputError
 from ..util.files import replacing
 
-#: Suffix of the file with a run's times in other sessions.
+#: The suffix of the file with a run's times in other sessions.
 _TIMES = ".times.json"
 
 
@@ -33,21 +33,21 @@ class Run:
 
     Attributes:
         level: The budget: samples per pixel, or seconds.
-        round: Index of the repetition, from 0 on.
-        seed: Its seed.
-        spp: Samples per pixel that were taken.
+        round: Index of the repetition, starting at 0.
+        seed: The seed.
+        spp: Samples per pixel taken.
         seconds: Time of the render, learning included, compilation excluded: wall clock, or CPU
             time of all threads.
-        rays: Rays traced by kind (``camera``, ``scatter``, ``shadow``), empty if not known.
-        connections: Connections to lights that were considered (``path`` traces a shadow ray for
-            each), ``None`` if not known.
-        zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
-        memory: Peak of the memory that Dr.Jit held, in bytes.
-        launches: Kernels launched.
+        rays: Rays traced, by kind (``camera``, ``scatter``, ``shadow``); empty if unknown.
+        connections: Connections to lights considered (``path`` traces a shadow ray for each);
+            ``None`` if unknown.
+        zero_radiance: Fraction of camera samples without radiance; ``None`` if unknown.
+        memory: Dr.Jit's peak memory, in bytes.
+        launches: Number of kernel launches.
         mean: Mean of the image over pixels and channels.
         learned: What the integrator says that it learned; empty if it says nothing.
-        session: The session in which it was measured. Integrators take turns within a session only.
-        timed_again: Seconds that the same render took in later sessions, by session.
+        session: The session in which it was measured. Integrators take turns only within a session.
+        timed_again: Time of the same render in later sessions, in seconds, by session.
         path: The EXR that holds the image.
         errors: Its errors against the reference of the experiment, or between seeds.
     """
@@ -80,17 +80,17 @@ class Run:
 
     @property
     def shadow_share(self) -> float | None:
-        """Shadow rays traced, as a fraction of those that ``path`` would trace."""
+        """The number of shadow rays, as a fraction of the number that ``path`` would trace."""
         return self.rays["shadow"] / self.connections if self.connections else None
 
     @property
     def times(self) -> dict[str, float]:
-        """Seconds by session: its own first, then those in which it was timed again."""
+        """The time in seconds by session: the run's own session first, then later ones."""
         return {self.session: self.seconds, **self.timed_again}
 
     @property
     def is_timed_now(self) -> bool:
-        """Was it timed in this session?"""
+        """Whether it was timed in this session."""
         return marks.SESSION in self.times
 
     def record(self) -> dict[str, object]:
@@ -103,11 +103,11 @@ class RunFolder:
     """The runs of one scene on disk.
 
     Args:
-        folder: The folder of the EXRs; made when the first one is written.
-        identity: What all runs of the scene depend on: scene, versions, machine.
+        folder: The folder of the EXRs; made when the first EXR is written.
+        identity: Everything on which all runs of the scene depend: scene, versions, machine.
 
     Attributes:
-        faults: What is wrong with the files that :meth:`load` found damaged.
+        faults: The faults of the files that :meth:`load` found damaged.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, object]) -> None:
@@ -120,7 +120,7 @@ class RunFolder:
 
         Args:
             label: The integrator's label, which makes the name readable.
-            integrator: The integrator's identity: everything that its images depend on.
+            integrator: The integrator's identity: everything on which its images depend.
             level: The level with its unit (``64spp``, ``10s``).
             round, seed: Round and seed of the run.
         """
@@ -131,8 +131,7 @@ class RunFolder:
         return self.folder / name
 
     def load(self, path: Path) -> Run | None:
-        """A run that was finished earlier; ``None`` if there is none, or its file is damaged, or
-        the file of another run."""
+        """A run finished earlier; ``None`` if its file is missing, damaged or of another run."""
         if not path.is_file():
             return None
         try:
@@ -158,7 +157,7 @@ class RunFolder:
         return replace(run, path=path)
 
     def add_time(self, run: Run, seconds: float) -> None:
-        """Stores the seconds that a run took when it was repeated in this session."""
+        """Stores the time of a run repeated in this session."""
         run.timed_again[marks.SESSION] = seconds
         with replacing(run.path.with_suffix(_TIMES)) as temporary:
             times = json.dumps(run.timed_again)

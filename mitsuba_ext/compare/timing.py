@@ -1,4 +1,4 @@
-"""Times renders, and renders for a given time."""
+"""Measures the time of renders, and renders for a given time."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from ..scene.unseen import check_all_is_seen
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Limit of ``samples_for``: with more, even a film of 16x16 pixels exceeds the 2^32 samples of a
-#: wavefront.
+#: The maximum samples per pixel of ``samples_for``: with more, even a film of 16x16 pixels exceeds
+#: the 2^32 samples of a wavefront.
 _MAX_SPP = 2**24
 
-#: The time of a render jumps if it is more than this multiple of what its samples account for.
+#: The ratio of a render's time to the time predicted from its samples that counts as a jump.
 _JUMP = 1.25
 
-#: A render shorter than this (in seconds) is timed twice, as a short disturbance can double its
-#: time.
+#: The time, in seconds, below which renders are timed twice: a disturbance can double it.
 _SHORT = 0.5
 
 
@@ -35,11 +34,11 @@ class Timed(NamedTuple):
     Attributes:
         seconds: Time of the whole render, learning and compilation included: wall clock, or CPU
             time of all threads.
-        compiled: Was a kernel compiled, or loaded from the disk?
-        compile_seconds: Time to compile or load kernels, without tracing.
+        compiled: Whether a kernel was compiled or loaded from the disk.
+        compile_seconds: The time to compile or load kernels, without tracing.
         launches: Number of kernel launches.
-        spp: Samples per pixel that were taken.
-        memory: Peak of the memory that Dr.Jit held, the scene included, in bytes.
+        spp: Samples per pixel taken.
+        memory: Dr.Jit's peak memory, including the scene, in bytes.
         image: The developed image.
     """
 
@@ -102,9 +101,10 @@ def timed_render(
 
 
 def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) -> bool:
-    """Does the integrator learn in pilots, and plan them for a ``timeout`` (``rendering/pace.py``)?
+    """Whether the integrator learns in pilots and plans them for a ``timeout``
+    (``rendering/pace.py``).
 
-    The time of such a render does not grow evenly with its samples: with a few more, it begins to
+    The time of such a render does not grow steadily with its samples: with a few more, it begins to
     learn. Often, no number of samples takes a given time.
     """
     view = scene.sensors()[sensor]
@@ -112,7 +112,7 @@ def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) 
         return False
     spp = _more_than_fit(view)
     learns = integrator.plan_learning(scene, view, spp).pilots
-    # Sets of samples would be smaller with a timeout
+    # With a timeout, sample sets would be smaller
     has_sets = integrator.samples_per_set(spp) > 1
     return bool(learns and not has_sets and integrator.pace_stage(scene, view, spp))
 
@@ -120,7 +120,7 @@ def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) 
 def render_for(
     seconds: float, integrator: mi.Integrator, scene: mi.Scene, seed: int, sensor: int = 0
 ) -> Timed:
-    """Renders for ``seconds``, with an integrator for which :func:`plans_for_time` is true: as
+    """Renders for ``seconds`` with an integrator for which :func:`plans_for_time` is true, like
     :func:`timed_render` with the parameter ``timeout``."""
     own = integrator.timeout
     integrator.timeout = min(own, seconds) if own > 0 else seconds
@@ -132,13 +132,13 @@ def render_for(
 
 
 def _more_than_fit(sensor: mi.Sensor) -> int:
-    """Samples per pixel that take longer than any time limit, about an hour."""
+    """A number of samples per pixel that takes longer than any time limit, about an hour."""
     pixel_count = math.prod(film_extent(sensor.film()))
     return min(_MAX_SPP, max(1 << 20, (1 << 32) // pixel_count))
 
 
 def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
-    """Statistics of the last render, if the integrator is one of ours; else ``None``."""
+    """The statistics of the last render if the integrator is one of ours; otherwise ``None``."""
     report = getattr(integrator, "statistics", None)
     return report if isinstance(report, RenderStatistics) else None
 
@@ -151,16 +151,16 @@ def samples_for(
     sensor: int = 0,
     cpu_time: bool = False,
 ) -> int:
-    """How many samples per pixel take ``budget`` seconds.
+    """The number of samples per pixel that takes ``budget`` seconds.
 
-    Mitsuba's own integrators ignore ``timeout`` outside of the scalar variants, and most of ours
-    render otherwise with it. Therefore, this function measures the speed and computes the number.
-    It doubles the samples until a render takes an eighth of the budget (or four seconds). The last
-    two renders give the cost of a sample and the fixed cost of a render.
+    Mitsuba's own integrators ignore ``timeout`` except in scalar variants, and most of ours render
+    differently with it. Therefore, this function measures the speed and computes the number. It
+    doubles the samples until a render takes an eighth of the budget (or four seconds). The last two
+    renders give the cost of a sample and the fixed cost of a render.
 
     If the time more than doubles with the samples, the longer render does something that the
-    shorter one does not, such as learning, and the two tell nothing about a render in between.
-    Then, this function measures a longer one, or looks for the number of samples between the two.
+    shorter one does not, such as learning, and the two say nothing about a render in between. This
+    function then measures a longer one, or searches for the number of samples between the two.
     """
 
     def seconds_of(spp: int) -> float:
@@ -194,7 +194,7 @@ def samples_for(
 
 
 def _between(seconds_of: Callable[[int], float], fits: int, too_many: int, budget: float) -> int:
-    """The most samples that fit into ``budget`` seconds, up to an eighth of those that do."""
+    """The largest number of samples that fits into ``budget`` seconds, to within an eighth."""
     while too_many - fits > max(1, fits // 8):
         middle = (fits + too_many) // 2
         if seconds_of(middle) <= budget:

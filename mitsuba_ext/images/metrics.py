@@ -22,8 +22,7 @@ import numpy as np
 from .box_filter import box_means
 from .flip import mean_flip
 
-#: The term ε in the denominator of the relative error, as a multiple of the reference's squared
-#: mean.
+#: The term ε in the relative error, as a multiple of the reference's squared mean.
 RELATIVE_FLOOR = 1e-2
 
 #: The percentile of the relative errors of pixels that represents the worst ones.
@@ -35,8 +34,7 @@ TRIMMED_SHARE = 1e-3
 #: The minimum number of images that :func:`errors_between_seeds` can measure.
 MIN_SEEDS = 3
 
-#: The weights of the channels in a colour difference: their contributions to luminance [Cline
-#: 2007].
+#: The channels' weights in a colour difference: their contributions to luminance [Cline 2007].
 COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
 
@@ -159,8 +157,7 @@ def reference_noise(reference: np.ndarray, reference_variance: np.ndarray) -> fl
 
 
 def describe_non_finite(image: np.ndarray) -> str:
-    """Says how many pixels hold NaN or infinity, and where the first one is; empty if all are
-    finite."""
+    """Says how many pixels hold NaN or infinity, and where the first one is; empty if none do."""
     bad = ~np.isfinite(image).all(axis=2)
     count = int(bad.sum())
     if count == 0:

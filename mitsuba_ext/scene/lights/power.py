@@ -52,7 +52,7 @@ def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
         e.nested.get_shape() if is_moving_light(e) else shape
         for e, shape in zip(scene.emitters(), emitter_shapes(scene))
     ]
-    # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, including those of
+    # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, even of
     # other scenes
     senders = [functools.partial(_radiated, at_rest[i], shapes[i]) for i in indices]
     index, sampler = _lanes(len(indices))
