@@ -66,13 +66,11 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--no-reference", is_flag=True,
-    help="Take the variance between the seeds as the error. Bias shows in the means of the images "
-    "only.",
+    help="Take the variance between seeds as the error. Bias shows only in the images' means.",
 )
 @click.option(
     "--cpu", is_flag=True,
-    help="Measure CPU time of all threads instead of the wall clock, on a machine that does other "
-    "work.",
+    help="Measure the CPU time of all threads, not the wall clock, on a machine with other work.",
 )
 @click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",

@@ -85,18 +85,18 @@ class Comparison:
             shared cores are not comparable.
         command: The command line, for the report.
         only_stored: Whether to render nothing, and make figures and report from the stored runs.
-        with_reference: ``False`` needs no reference: errors are the variance between the seeds,
-            which does not contain bias.
-        cpu_time: Measure the CPU time of all threads, which other programs on the machine hardly
-            change, instead of the wall clock.
+        with_reference: Whether to measure errors against a reference. Without one, errors are the
+            variance between seeds, which does not include bias.
+        cpu_time: Whether to measure the CPU time of all threads instead of the wall clock. Other
+            programs on the machine hardly change it.
         warn: A function that is called with each remark about a scene, its reference and its stored
             runs as soon as it is known; the results also hold the remarks.
 
     Raises:
-        InputError: No scene was given, an integrator cannot be made, ``budget`` is no
+        InputError: No scene was given, an integrator cannot be made, ``budget`` is not a
             :class:`Budget`, ``seeds`` is below 1 (3 without a reference), ``until`` has no
-            reference, the variant is a scalar one, or CPU time is asked for and it is not an LLVM
-            one, or the name of the folder is empty.
+            reference, the variant is scalar, CPU time is requested without an LLVM variant, or the
+            folder has no name.
     """
 
     def __init__(

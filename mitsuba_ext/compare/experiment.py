@@ -1,6 +1,6 @@
 """Measures the time and error of several integrators on one scene, under equal conditions.
 
-- Errors are measured against a reference, or, without one, between the seeds of each integrator.
+- Errors are measured against a reference or, without one, between the seeds of each integrator.
 
 - Every integrator gets the settings of the scene's own integrator (``max_depth``, ``rr_depth``,
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
@@ -57,7 +57,7 @@ class Experiment:
         rounds: The number of runs of each integrator at each level.
         folder: The folder that stores the runs; stored runs are not rendered again.
         only_stored: Whether to use only the stored runs and render nothing.
-        cpu_time: Measure the CPU time of all threads, not the wall clock.
+        cpu_time: Whether to measure the CPU time of all threads instead of the wall clock.
         warn: A function that is called with each sentence added to :attr:`remarks`.
 
     Attributes:
@@ -120,8 +120,8 @@ class Experiment:
         """Measures everything. The results are in :attr:`contenders`, even after an interruption.
 
         Args:
-            reference: The image against which errors are measured; ``None`` to measure them between
-                the seeds.
+            reference: The image against which errors are measured; ``None`` to measure between
+                seeds.
             progress: A function that is called before each run.
         """
         self.reference = reference

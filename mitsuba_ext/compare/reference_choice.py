@@ -50,8 +50,8 @@ def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
         why = f'"bdpt" renders the reference: no camera path finds {missed}'
         if "smooth" in missed:
             why += (
-                "; where such light is seen in a mirror, or through glass, the reference still lacks "
-                'it ("vcm" has it, slightly blurred)'
+                "; where such light is seen in a mirror, or through glass, the reference still "
+                'lacks it ("vcm" has it, slightly blurred)'
             )
         return ReferenceChoice("bdpt", (why,))
     lacks = _lacks(missed, '"bdpt" cannot render this scene')

@@ -53,7 +53,7 @@ bounds are null for a single one), or null where there is none. Other unknown nu
     versions   mitsuba_ext, mitsuba, drjit, variant, numpy, python
     machine    system, processor, cores
 
-Seconds are without compilation, learning included.
+Seconds include learning but not compilation.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def _timed_ratios(
     Args:
         pairs: Runs of an integrator, and of the first one in the same rounds.
         errors: The ratio of their errors.
-        name: Which errors these are.
+        name: The name of these errors.
     """
     timed = [
         (own, other, _common_times(own, other)) for own, other in pairs

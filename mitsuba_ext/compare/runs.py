@@ -36,20 +36,20 @@ class Run:
         round: Index of the repetition, starting at 0.
         seed: The seed.
         spp: Samples per pixel taken.
-        seconds: Time of the render, learning included, compilation excluded: wall clock, or CPU
-            time of all threads.
+        seconds: Time of the render (wall clock, or CPU time of all threads), including learning but
+            not compilation.
         rays: Rays traced, by kind (``camera``, ``scatter``, ``shadow``); empty if unknown.
         connections: Connections to lights considered (``path`` traces a shadow ray for each);
             ``None`` if unknown.
         zero_radiance: Fraction of camera samples without radiance; ``None`` if unknown.
         memory: Dr.Jit's peak memory, in bytes.
         launches: Number of kernel launches.
-        mean: Mean of the image over pixels and channels.
-        learned: What the integrator says that it learned; empty if it says nothing.
+        mean: The mean of the image over pixels and channels.
+        learned: The integrator's report on what it learned; empty if there is none.
         session: The session in which it was measured. Integrators take turns only within a session.
         timed_again: Time of the same render in later sessions, in seconds, by session.
         path: The EXR that holds the image.
-        errors: Its errors against the reference of the experiment, or between seeds.
+        errors: The errors against the reference of the experiment, or between seeds.
     """
 
     level: float

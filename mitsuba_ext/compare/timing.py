@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 _MAX_SPP = 2**24
 
 #: The ratio of a render's time to the time predicted from its samples that counts as a jump.
-_JUMP = 1.25
+_JUMP_RATIO = 1.25
 
 #: The time, in seconds, below which renders are timed twice: a disturbance can double it.
-_SHORT = 0.5
+_SHORT_SECONDS = 0.5
 
 
 class Timed(NamedTuple):
     """A render and its cost.
 
     Attributes:
-        seconds: Time of the whole render, learning and compilation included: wall clock, or CPU
-            time of all threads.
+        seconds: Time of the whole render (wall clock, or CPU time of all threads), including
+            learning and compilation.
         compiled: Whether a kernel was compiled or loaded from the disk.
         compile_seconds: The time to compile or load kernels, without tracing.
         launches: Number of kernel launches.
@@ -166,7 +166,7 @@ def samples_for(
     def seconds_of(spp: int) -> float:
         arguments = integrator, scene, seed, spp, sensor, cpu_time
         seconds, compiled, *_ = timed_render(*arguments)
-        if compiled or seconds < _SHORT:
+        if compiled or seconds < _SHORT_SECONDS:
             seconds = min(seconds, timed_render(*arguments).seconds)
         return seconds
 
@@ -178,7 +178,7 @@ def samples_for(
     while True:
         spp *= 2
         seconds = seconds_of(spp)
-        jumps = seconds > _JUMP * 2 * shorter
+        jumps = seconds > _JUMP_RATIO * 2 * shorter
         is_measured = seconds >= min(budget / 8, 4) and not (jumps and seconds < budget / 2)
         if is_measured or spp >= _MAX_SPP:
             break

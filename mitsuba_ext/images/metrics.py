@@ -25,7 +25,7 @@ from .flip import mean_flip
 #: The term ε in the relative error, as a multiple of the reference's squared mean.
 RELATIVE_FLOOR = 1e-2
 
-#: The percentile of the relative errors of pixels that represents the worst ones.
+#: The percentile of the pixels' relative errors that represents the worst pixels.
 _WORST = 99
 
 #: The fraction of pixels, with the largest errors, that the trimmed relMSE omits.
@@ -40,8 +40,8 @@ COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
 @dataclass(frozen=True)
 class Errors:
-    """The figures of one image. All but ``relmse_worst``, ``sigma_mu`` and ``flip`` are means over
-    pixels and channels.
+    """The figures of one image. All except ``relmse_worst``, ``sigma_mu`` and ``flip`` are means
+    over pixels and channels.
 
     Attributes:
         relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
@@ -97,11 +97,11 @@ def errors(
 def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> list[Errors]:
     """The figures of images of one integrator that differ in their seeds, without a reference.
 
-    In its place is, for each image, the mean of the others, and the variance of this mean is
-    subtracted: (n (I − M)² − V) / (n − 2), if M is the mean of all n images and V their variance.
-    The mean of ``mse`` over the images is then the mean of V, which does not contain bias. The
-    trimmed relMSE leaves out the pixels with the largest V. FLIP is unknown, and so are all figures
-    of fewer than three images.
+    For each image, the mean of the others takes its place, and the variance of this mean is
+    subtracted: (n (I − M)² − V) / (n − 2), where M is the mean of all n images and V their
+    variance. The mean of ``mse`` over the images is then the mean of V, which does not include
+    bias. The trimmed relMSE omits the pixels with the largest V. FLIP is unknown, as are all
+    figures of fewer than three images.
 
     Args:
         images: The images.
@@ -115,7 +115,7 @@ def errors_between_seeds(images: Sequence[np.ndarray], scale: np.ndarray) -> lis
     mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1)
     weight = _weight(np.stack([box_means(x) for x in np.moveaxis(scale, 2, 0)], axis=2))
     seen = (variance * weight).mean(axis=2)
-    # The differences from the mean of all, which contains each image itself, are too small
+    # Differences from the mean of all images, which includes the image itself, are too small
     correction = math.sqrt(count / (count - 1))
     return [
         _errors(
@@ -130,7 +130,7 @@ def _errors(
     squared: np.ndarray, weight: np.ndarray, seen: np.ndarray, sigma_mu: float, flip: float
 ) -> Errors:
     """The figures of an image from its squared errors, and their weights in relative errors. The
-    trimmed relMSE leaves out the pixels that have the largest values of ``seen``."""
+    trimmed relMSE omits the pixels with the largest values of ``seen``."""
     mse = float(squared.mean())
     relative = (squared * weight).mean(axis=2)
     return Errors(

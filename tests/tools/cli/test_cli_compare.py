@@ -232,7 +232,7 @@ def test_truncated_reference_is_one_line(make_scene, tmp_path, capfd):
         (["scene.xml", "path", "--until", "0.1", "--no-reference"], "without a reference"),
         (
             ["scene.xml", "path", "--spp", "1", "--no-reference", "--reference-spp", "8"],
-            "exclude each other",
+            "cannot be combined",
         ),
         (["scene.xml", "neepp:aovs=depth", "--spp", "1"], '"neepp": the parameter "aovs" must be'),
         (["scene.xml", "variance:a=[path", "--spp", "1"], 'found "[" without "]"'),
