@@ -102,7 +102,7 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
             "composed_path:next_event=learned_lights",
             "'learned_lights'; it must be one of uniform, power, spatial, linear, visibility, "
             "contribution, resampled, two_stage, triple_product, portals, or a nested plugin: "
-            '"learned_lights" or "spatial_lights" or "resampled_lights" or "two_stage_lights" or '
+            '"spatial_lights" or "learned_lights" or "resampled_lights" or "two_stage_lights" or '
             '"portal_lights": nest the plugin (on the command line: next_event=[learned_lights])',
         ),
         ("composed_path:connections=-3", 'the parameter "connections" is -3; it must be at least'),
