@@ -17,10 +17,13 @@ def _furnaces():
     return {furnace.path.stem: furnace for furnace in module.FURNACES}
 
 
+#: The furnaces of ``scenes/furnaces.py``, by the names of their scenes.
 FURNACES = _furnaces()
 
-#: Of the films, and samples per pixel.
+#: Width and height of the films.
 SIZE = 32
+
+#: Samples per pixel.
 SPP = 256
 
 

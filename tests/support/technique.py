@@ -1,4 +1,4 @@
-"""What a technique of the tests is, and which tests it can get."""
+"""A technique that the tests render with, and the tests that it can get."""
 
 from __future__ import annotations
 
@@ -20,10 +20,6 @@ SCENES: dict[str, tuple[int, int]] = {
     "window": (3, 256),
 }
 
-FURNACES = (
-    "furnace_box", "furnace_convex", "furnace_glass", "furnace_isothermal", "furnace_lamps",
-)  # fmt: skip
-
 DEPTHS = (1, 2, 3, 6, -1)
 
 
@@ -32,8 +28,8 @@ class Checks:
     """The tests of a technique.
 
     Attributes:
-        scenes: Scenes in which its mean is compared with that of ``path``.
-        variants: Additional variants for this.
+        scenes: Scenes in which its mean is compared with the mean of ``path``.
+        variants: Additional variants for the comparison of means, in one scene.
         furnaces, depths: Furnaces with an exact answer, and values of ``max_depth``.
         cases: Hard cases.
     """
@@ -56,15 +52,15 @@ class Technique:
     Attributes:
         plugin: The name of the integrator.
         parameters: Its parameters besides ``max_depth``.
-        nested: The integrator whose samples it draws, where it draws those of another one; that one
-            gets ``max_depth`` and what a test says.
-        is_plugin: Does it represent its plugin? Then it also gets the tests of seeds, errors,
+        nested: The nested integrator, of a plugin that draws the samples of another one. It gets
+            ``max_depth`` and the parameters that a test sets.
+        is_plugin: True if it represents its plugin. Then it also gets the tests of seeds, errors,
             gradients and AOVs.
-        draws_like_path: At the same seed, does it draw the same numbers as ``path``? Then images
-            are compared, which has more power than comparing means.
-        makes_splats: Does one sample bring light to many pixels, or do pixels share photons? Then
-            the errors of pixels depend on each other, and noise is estimated from many seeds.
-        checks, thorough: Its tests.
+        draws_like_path: True if, with the same seed, it draws the random numbers that ``path``
+            draws. Then images are compared, which detects smaller errors than comparing means.
+        makes_splats: True if one sample brings light to many pixels, or if pixels share photons.
+            Then the errors of pixels depend on each other, and noise is estimated from many seeds.
+        checks, thorough: Its tests: in each run, and in slow runs.
     """
 
     plugin: str
