@@ -1,32 +1,19 @@
-"""``mitsuba-ext render``: what it writes, and what ends it."""
+"""``mitsuba-ext render``: the integrator, the scene and its changes, warnings."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import importlib
 import json
-import os
 import re
-import signal
 import sys
-import time
-from pathlib import Path
 
-import click
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsuba_ext.cli import image_render
-from mitsuba_ext.cli.stopping import Stop, stopping
-from mitsuba_ext.compare import load_scene, read_exr, timing, write_exr
-from mitsuba_ext.images import image_files
+from mitsuba_ext.compare import load_scene, read_exr, timing
 from mitsuba_ext.inputs.scene_remarks import scene_remarks
-from mitsuba_ext.rendering import interrupts, plan, seed_passes
-from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.util import marks
 from tests.support.command_line import PATH, PLAIN_PATH
 
 
@@ -106,23 +93,6 @@ def test_a_scene_without_integrator_needs_one_where_auto_is_not_supported(
     assert code == 2 and "no integrator: name one" in err and str(scene) in err
 
 
-@pytest.mark.parametrize("extension", ["png", "jpg", "hdr", "pfm"])
-def test_render_writes_other_formats(run, make_scene, tmp_path, extension):
-    output = tmp_path / f"image.{extension}"
-    assert run("render", make_scene(), "-o", output)[0] == 0
-    bitmap = mi.Bitmap(str(output))
-    assert (bitmap.width(), bitmap.height()) == (8, 6)
-    assert bitmap.srgb_gamma() == (extension in ("png", "jpg"))
-
-
-def test_render_keeps_aovs_in_an_exr_and_leaves_them_out_of_a_png(run, make_scene, tmp_path):
-    integrator = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{PATH}</integrator>'
-    scene = make_scene(integrator=integrator)
-    assert run("render", scene, "-o", tmp_path / "image.exr")[0] == 0
-    assert "d.T" in read_exr(tmp_path / "image.exr")[0]
-    assert run("render", scene, "-o", tmp_path / "image.png")[0] == 0
-
-
 def test_first_render_says_that_it_compiles(run, make_scene, tmp_path, monkeypatch):
     command = image_render
     # Before the scene is loaded, after that, after the render
@@ -185,38 +155,6 @@ def test_render_fills_a_time(run, make_scene, tmp_path):
     metadata = read_exr(tmp_path / "a.exr")[1]
     # Loose: other processes share the machine
     assert 0.1 < metadata["seconds"] < 5
-
-
-def test_a_file_that_another_render_writes_is_refused(run, make_scene, tmp_path):
-    output = tmp_path / "out" / "a.exr"
-    output.parent.mkdir()
-    command = ("render", make_scene(), "-o", output, "--spp", 1)
-    with marks.written_alone(output):
-        code, _, err = run(*command)
-        assert code == 2 and f"another render writes this file (process {os.getpid()})" in err
-        assert run(*command[:3], tmp_path / "b.exr", "--spp", 1)[0] == 0
-    assert run(*command)[0] == 0
-    assert [path.name for path in output.parent.iterdir()] == ["a.exr"]
-
-
-@pytest.mark.parametrize("which", ["a.exr", "a.noisy.exr", "b.png"])
-def test_a_read_only_target_is_found_before_the_render(
-    run, make_scene, tmp_path, monkeypatch, which
-):
-    """Not by its mode, as the user that runs the tests may write all files."""
-    (tmp_path / which).touch()
-
-    def access(path, mode, *, _access=os.access, **named) -> bool:
-        is_refused = mode == os.W_OK and Path(path).name == which
-        return not is_refused and _access(path, mode, **named)
-
-    monkeypatch.setattr(os, "access", access)
-    monkeypatch.setattr(image_render, "select_variant", lambda *_: pytest.fail("too late"))
-    options = ("--preview", tmp_path / "b.png", "--denoise")
-    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", *options)
-    assert code == 2 and f"{which}: is read-only" in err
-    code, _, err = run("render", make_scene(), "-o", tmp_path / "none" / "a.exr")
-    assert code == 2 and "no such folder" in err
 
 
 _CHANGES = ["--size", "12x8", "--crop", "5x4+6+3", "--filter", "tent:radius=2", "--max-depth", 1]
@@ -303,205 +241,6 @@ def test_size_of_a_sensor_without_film(make_scene):
     assert mi.render(loaded.scene, spp=1).shape == (4, 10, 3)
 
 
-@pytest.fixture
-def interrupted_integrator():
-    """An integrator that Ctrl-C ends after the image (seed 0) or before it (other seeds)."""
-    mi.set_variant("llvm_ad_rgb")
-    prb = type(mi.load_dict({"type": "prb"}))
-
-    class Interrupted(prb):
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            if seed == 0:
-                super().render(scene, sensor, seed, spp, develop, evaluate)
-            raise KeyboardInterrupt
-
-    mi.register_integrator("interrupted", lambda props: Interrupted(props))
-    return "interrupted"
-
-
-def test_interrupted_render_writes_what_the_film_holds(
-    run, make_scene, tmp_path, interrupted_integrator
-):
-    output = tmp_path / "image.exr"
-    arguments = ("render", make_scene(), "-o", output, "--integrator", interrupted_integrator)
-    code, _, err = run(*arguments)
-    assert code == 130
-    assert err.splitlines()[0] == f"interrupted during the render: {output}"
-    assert read_exr(output)[0]["R"].shape == (6, 8)
-
-
-@pytest.mark.parametrize("when", [("--seed", "1"), ("--time", "5")])
-def test_render_interrupted_before_its_first_pass_leaves_an_older_file_alone(
-    run, make_scene, tmp_path, interrupted_integrator, when
-):
-    output = tmp_path / "image.exr"
-    output.write_bytes(b"older")
-    arguments = ("render", make_scene(), "-o", output, "--integrator", interrupted_integrator)
-    code, _, err = run(*arguments, *when)
-    assert code == 130
-    assert err.count("\n") == 1 and "nothing written" in err
-    assert output.read_bytes() == b"older"
-
-
-@pytest.fixture(params=["path", "composed_path"])
-def third_pass_gets(request, monkeypatch):
-    """What makes every third pass of 4 samples get signals, 10 ms from each other; returns the
-    integrator."""
-    job, name, lengths = {
-        "path": (seed_passes.SeedPasses, "_run_pass", seed_passes),
-        "composed_path": (rendering.Job, "run_pass", plan),
-    }[request.param]  # fmt: skip
-    monkeypatch.setattr(lengths, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
-    monkeypatch.setattr(lengths, "_PASS_SPP", 1)
-    run_pass, passes = getattr(job, name), []
-
-    def set_signals(*names: str) -> str:
-        def interrupted(self, *arguments):
-            passes.append(self)
-            for name in names if len(passes) % 3 == 0 else ():
-                os.kill(os.getpid(), getattr(signal, name))
-                time.sleep(0.01)
-            return run_pass(self, *arguments)
-
-        monkeypatch.setattr(job, name, interrupted)
-        return request.param
-
-    return set_signals
-
-
-@pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_a_signal_ends_the_render_after_a_pass_and_keeps_an_older_image(
-    run, make_scene, tmp_path, third_pass_gets, name, code
-):
-    integrator = third_pass_gets(name)
-    output, partial = tmp_path / "image.exr", tmp_path / "image.partial.exr"
-    arguments = ("render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40)
-    for target in (output, partial):
-        found, _, err = run(*arguments)
-        assert found == code
-        assert f"interrupted after 12 of 40 spp: {target}" in err
-        metadata = read_exr(target)[1]
-        assert (metadata["spp"], metadata["interrupted"]) == (12, "true")
-    assert f"{output} is an older image" in err
-    assert sorted(tmp_path.iterdir()) == [output, partial, tmp_path / "scene.xml"]
-    for wanted in (["--spp", 12], ["-D", "spp=12"]):
-        assert run(*arguments[:-2], *wanted)[0] == 0, "the last pass had all samples"
-        assert read_exr(output)[1]["interrupted"] == "false"
-
-
-@pytest.mark.parametrize("names", [("SIGHUP", "SIGTERM", "SIGINT"), ("SIGINT", "SIGINT")])
-def test_signals_that_come_together_count_as_one(
-    run, make_scene, tmp_path, third_pass_gets, names
-):
-    """As from a closed terminal, to which printing messages fails too."""
-    output, integrator = tmp_path / "a.exr", third_pass_gets(*names)
-    code, _, err = run(
-        "render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40
-    )
-    assert code == 128 + getattr(signal, names[0]) and "after 12 of 40 spp" in err
-    assert read_exr(output)[1]["spp"] == 12
-
-
-def test_second_signal_that_python_hears_of_late_does_nothing():
-    """Handlers run after native code, so the time between two calls of a handler is not the time
-    between two signals."""
-    stop = Stop()
-    with pytest.raises(KeyboardInterrupt):
-        stop(signal.SIGHUP, None)
-    stop._time -= 100
-    stop(signal.SIGTERM, None)
-    assert stop.exit_code == 129
-
-
-def test_terminal_that_is_closed_keeps_the_image_and_the_exit_code(
-    run, make_scene, tmp_path, third_pass_gets, monkeypatch
-):
-    def gone(*_, **__):
-        raise OSError(errno.EIO, "Input/output error")
-
-    output, integrator = tmp_path / "a.exr", third_pass_gets("SIGHUP")
-    monkeypatch.setattr(click, "echo", gone)
-    arguments = ("render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40)
-    assert run(*arguments)[0] == 129
-    assert read_exr(output)[1]["spp"] == 12
-
-
-def test_signals_do_not_interrupt_the_writing_of_the_image(
-    run, make_scene, tmp_path, third_pass_gets, monkeypatch
-):
-    integrator, write, exits = third_pass_gets("SIGTERM"), image_files.write_film, []
-    monkeypatch.setattr(interrupts, "TOGETHER", 0.02)
-    monkeypatch.setattr(os, "_exit", exits.append)
-
-    def interrupted(path, film, metadata, *others, **options):
-        for name in ("SIGTERM", "SIGINT") if metadata else ():  # else it is the trial
-            time.sleep(0.05)
-            os.kill(os.getpid(), getattr(signal, name))
-        time.sleep(0.05)
-        write(path, film, metadata, *others, **options)
-
-    monkeypatch.setattr(image_files, "write_film", interrupted)
-    output = tmp_path / "a.exr"
-    arguments = ("render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40)
-    assert (run(*arguments)[0], exits) == (143, [])
-    assert read_exr(output)[1]["spp"] == 12
-
-
-def test_signals_that_are_ignored_stay_so():
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with interrupts.deferred_interrupt():
-            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-        with stopping() as stop, interrupts.deferred_interrupt() as interrupt:
-            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert interrupt.is_set() and stop.exit_code == 143
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-def test_a_second_signal_ends_the_process_whatever_runs(run, make_scene, tmp_path, monkeypatch):
-    mi.set_variant("llvm_ad_rgb")
-    prb = type(mi.load_dict({"type": "prb"}))
-    exits: list[int] = []
-
-    class Stubborn(prb):
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            while not exits:
-                with contextlib.suppress(KeyboardInterrupt):
-                    os.kill(os.getpid(), signal.SIGINT)
-                    time.sleep(0.01)
-            raise KeyboardInterrupt
-
-    mi.register_integrator("stubborn", lambda props: Stubborn(props))
-    monkeypatch.setattr(interrupts, "TOGETHER", 0.02)
-    monkeypatch.setattr(os, "_exit", exits.append)
-    arguments = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", "stubborn")
-    assert run(*arguments)[0] == 130 and exits[0] == 130
-    assert not (tmp_path / "a.exr").exists()
-
-
-def test_output_that_cannot_hold_the_film_is_refused_before_rendering(
-    run, make_scene, tmp_path, monkeypatch
-):
-    scene = make_scene(film='<spectrum name="band" value="400:1, 700:1"/>')
-    scene.write_text(scene.read_text().replace("hdrfilm", "specfilm"))
-    arguments = ("render", scene, "--variant", "llvm_ad_spectral", "-o")
-    code, _, err = run(*arguments, tmp_path / "a.png")
-    assert code == 2 and 'the film "SpecFilm" has no RGB image: write it to an .exr' in err
-    assert run(*arguments, tmp_path / "a.exr")[0] == 0
-    assert set(read_exr(tmp_path / "a.exr")[0]) == {"band"}
-
-    def full_disk(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(type(tmp_path), "write_bytes", full_disk)
-    code, _, err = run("render", make_scene(), "-o", tmp_path / "b.exr")
-    assert code == 2 and "b.exr: cannot be written (No space left on device)" in err
-    assert not list(tmp_path.glob("b*"))
-
-
 def test_pixels_that_are_not_finite_are_counted(run, make_scene, tmp_path):
     bright = '<emitter type="constant"><rgb name="radiance" value="3e38"/></emitter>'
     scene = make_scene()
@@ -543,35 +282,6 @@ def test_remarks_fit_the_integrators_of_mitsuba(variant, name, words):
     remarks = scene_remarks(scene, mi.load_dict({"type": name}), name)
     assert len(remarks) == len(words)
     assert all(word in remark for word, remark in zip(words, remarks))
-
-
-def test_failing_write_leaves_an_older_file_alone(tmp_path, monkeypatch):
-    path = tmp_path / "image.exr"
-    write_exr(path, np.ones((2, 2, 3)), "RGB", {})
-    before = path.read_bytes()
-
-    def full_disk(*_):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(os, "replace", full_disk)
-    with pytest.raises(OSError):
-        write_exr(path, np.zeros((2, 2, 3)), "RGB", {})
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_film_that_does_not_fit_is_refused_at_once(run, make_scene, tmp_path):
-    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--size", "200000x200000")
-    assert code == 2 and "a film of 200000x200000 pixels with 4 channels needs at least" in err
-    assert not list(tmp_path.glob("tmp*"))
-
-
-def test_the_check_of_a_film_keeps_its_crop_window(tmp_path):
-    window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 5, "crop_height": 4}
-    film = mi.load_dict({"type": "hdrfilm", "width": 20, "height": 10, **window})
-    image_files.check_film(tmp_path / "a.exr", film, ["a.R"])
-    assert list(film.crop_size()) == [5, 4] and list(film.crop_offset()) == [3, 2]
-    assert list(film.size()) == [20, 10] and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

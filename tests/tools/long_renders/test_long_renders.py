@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
@@ -12,36 +11,15 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.compare import InputError
-from mitsuba_ext.images import metrics
-from mitsuba_ext.long_renders import dispatch, long_render
+from mitsuba_ext.long_renders import dispatch
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.folder import CheckpointFolder
-from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import Batch, RenderState
 from mitsuba_ext.rendering import batches
 from mitsuba_ext.rendering.batches import Batches
+from tests.support.long_renders import LEARNER, image, rendered
 
 pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
-
-
-@pytest.fixture
-def request_of(make_scene):
-    def make(specification: str | None = None, **options) -> RenderRequest:
-        return RenderRequest(str(make_scene()), specification=specification, **options)
-
-    return make
-
-
-def rendered(request: RenderRequest, state: RenderState | None = None, spp: int = 64, **options):
-    renderer = BatchRenderer(request)
-    render = LongRender(renderer, state or RenderState())
-    render.run(Goal(spp), **options)
-    return render.state
-
-
-def image(state: RenderState) -> np.ndarray:
-    contents = state.film.contents
-    return contents[..., :3] / (contents[..., 3:4] if state.film.has_weights else state.spp)
 
 
 # ---- Sums ----
@@ -155,77 +133,6 @@ def test_who_renders_does_not_matter(request_of):
         rendered(request, executor=Broken())
 
 
-def test_it_ends_when_the_error_is_small_enough(request_of):
-    """The error that batches announce is that of the image."""
-    request = request_of("path")
-    render = LongRender(BatchRenderer(request), RenderState())
-    assert render.run(Goal(error=4e-3))
-    assert 8 * 16 <= render.state.spp < 1 << 12 and render.error <= 4e-3
-    truth = rendered(request_of("path", seed=7), spp=1 << 13)
-    squares = [
-        metrics.relative_mse(
-            image(rendered(request_of("path", seed=seed), spp=render.state.spp)), image(truth)
-        )
-        for seed in range(10, 18)
-    ]
-    assert 0.7 < np.mean(squares) / render.error < 1.4
-    assert not render.run(Goal(error=1e-9), is_stopped=lambda: True)
-    assert render.run(Goal(spp=render.state.spp, error=1e-9))
-
-
-def test_a_black_image_has_no_error_to_reach(run, make_scene, tmp_path):
-    scene = make_scene()
-    scene.write_text(re.sub("<emitter.*?/>", "", scene.read_text()))
-    command = ("render", scene, "-o", tmp_path / "a.exr", "--until", "0.01")
-    code, _, err = run(*command)
-    assert code == 2 and "is black, or not finite, after 128 samples per pixel" in err
-    assert run(*command, "--spp", 256)[0] == 0
-    assert run(*command, "--spp", 1 << 20, "--time", 0.2)[0] == 0
-
-
-@pytest.fixture
-def paced(monkeypatch):
-    """A clock that only batches move: the first one compiles, and those after the fifth are
-    slow."""
-
-    class Clock:
-        now = 0.0
-
-        def perf_counter(self):
-            return self.now
-
-    clock, batch = Clock(), BatchRenderer.render
-    monkeypatch.setattr(long_render, "time", clock)
-
-    def timed(self, which, learned):
-        clock.now += 5 * (which.index == 0) + which.spp * (0.1 if which.index < 5 else 0.3)
-        return batch(self, which, learned)
-
-    monkeypatch.setattr(BatchRenderer, "render", timed)
-    return clock
-
-
-def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, paced):
-    render = LongRender(BatchRenderer(request_of("path")), RenderState())
-    assert render.run(Goal(seconds=15))
-    assert render.state.spp == 100
-
-
-@pytest.mark.parametrize(("seconds", "spp"), [(5.5, 5), (6.2, 12), (8.0, 30)])
-def test_a_time_in_which_few_batches_fit_is_kept(request_of, paced, seconds, spp):
-    """A batch of the usual length has 16 samples per pixel."""
-    render = LongRender(BatchRenderer(request_of("path")), RenderState())
-    assert render.run(Goal(seconds=seconds))
-    assert render.state.spp == spp and paced.now <= 1.05 * seconds
-
-
-def test_a_batch_learns_for_others_only_where_there_is_time_for_them(request_of, paced):
-    for seconds, learns in ((8.0, False), (40.0, True)):
-        state = RenderState()
-        LongRender(BatchRenderer(request_of(LEARNER)), state).run(Goal(seconds=seconds))
-        assert (state.learned is not None) == learns
-
-
 # ---- The folder ----
 
 
@@ -337,9 +244,6 @@ def test_two_processes_cannot_use_a_folder(request_of, tmp_path):
     with folder.in_use(), pytest.raises(InputError, match="another process uses this folder"):
         with folder.in_use():
             pass
-
-
-LEARNER = "composed_path:max_depth=3,next_event=contribution"
 
 
 def test_what_is_learned_is_learned_once(run, scenes, tmp_path, monkeypatch):

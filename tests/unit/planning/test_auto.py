@@ -1,4 +1,4 @@
-"""``auto`` begins as ``path``, and tries light paths between the pilots."""
+"""``auto`` begins as ``path`` and tries light paths between pilots; ``auto_path`` tries maps."""
 
 from __future__ import annotations
 
@@ -192,3 +192,28 @@ def test_samples_before_light_paths_are_left_out_where_these_have_far_less_varia
         weights.append(np.array(scene.sensors()[0].film().develop(raw=True))[..., -1].mean())
     assert weights[0] < 0.95 * weights[1]
     assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.05)
+
+
+# ---- ``auto_path``: maps of the numbers of camera rays ----
+
+
+def test_auto_path_uses_maps_of_times_where_they_pay() -> None:
+    scene = load("six_balls", width=96, height=54)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 2})
+    noise = batches(scene, plain, 64, [1, 2]).var(axis=0).mean()
+    integrator = mi.load_dict({"type": "auto_path", "max_depth": 2})
+    ours = batches(scene, integrator, 64, [1, 2]).var(axis=0).mean()
+    assert "times" in integrator.statistics.learned
+    assert ours < 0.4 * noise  # a tenth
+
+
+@pytest.mark.slow
+def test_where_no_ray_has_a_time_or_a_lens_point_auto_path_renders_the_same_image() -> None:
+    """The weights of stages do not change either."""
+    scene = load("cornell_box", width=32, height=18)
+    words = {"directions": "guided", "next_event": "contribution"}
+    images = [
+        batches(scene, mi.load_dict({**plugin, "max_depth": 4}), 32, [3])[0]
+        for plugin in ({"type": "auto_path"}, {"type": "composed_path", **words})
+    ]
+    assert_same_image(*images)

@@ -15,6 +15,7 @@ import pytest
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering.plan import Learning, RenderPlan
 from mitsuba_ext.rendering.stages import ChangedSchedule, OneStage, Stage
 from mitsuba_ext.util.arrays import add_own, channel_mean
 from tests.support.stage import area, stage
@@ -210,3 +211,12 @@ def test_lanes_add_to_their_own_places():
     for _ in range(2):
         add_own(target, mi.Float(1, 2, 3), mi.UInt32(2, 0, 3), mi.Bool(True, True, False))
     np.testing.assert_array_equal(target.numpy(), [4, 0, 2, 0])
+
+
+def test_passes_from_which_maps_are_learned_are_short_in_large_films() -> None:
+    pixels = 1920 * 1080
+    plan = RenderPlan(0, 64, (32, 32), Learning(), pixels, False, 16, 1)
+    assert plan.pass_length(32) == 16
+    assert plan.pass_length(32, 2 * pixels + 1) == 2
+    assert plan.pass_length(32, pixels // 2) == 1
+    assert RenderPlan(0, 64, (32, 32), Learning(), pixels, True, 8, 1).pass_length(32, pixels) == 8

@@ -1,5 +1,5 @@
-"""Where rays start that leave a surface: as Mitsuba's, but closer in small scenes, and where small
-objects have surfaces close to each other."""
+"""Rays that leave a surface start where Mitsuba's rays start, but closer to it in small scenes and
+between surfaces close to each other. Shadow rays do not rely on Mitsuba's bounds of scenes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.scene.bounds import scene_bounds
 from mitsuba_ext.transport.queries.scene import scene_query
 from mitsuba_ext.transport.ray_starts import RayStarts, ray_starts
 from tests.support.stage import area, diffuse, film, lookat, sensor, stage
@@ -156,3 +157,43 @@ def test_offsets_that_follow_rounding_errors_are_large_enough(kind: str) -> None
             faces = dr.dot(target.n, o - target.p) > 0
             blocked = faces & scene.ray_intersect_preliminary(towards).is_valid()
             assert dr.count(blocked)[0] < 5e-4 * dr.count(faces)[0]
+
+
+# ---- The bounds of scenes, which Mitsuba 3.9.1 misjudges ----
+
+
+def test_bounds_hold_merged_rectangles():
+    T = mi.ScalarTransform4f()
+    sides = {f"side_{z}": {"type": "rectangle", "to_world": T.translate([0, 0, z]).scale(9),
+                          "bsdf": diffuse()}
+             for z in (0, 5)}  # fmt: skip
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 0.2}, **sides})
+    assert len(scene.shapes()) == 2  # Mitsuba has merged shapes
+    box = scene_bounds(scene)
+    np.testing.assert_allclose([list(box.min), list(box.max)], [[-9, -9, -0.2], [9, 9, 5]])
+    assert not scene_bounds(mi.load_dict({"type": "scene"})).valid()
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_shadow_rays_end_at_the_light_or_never(moves):
+    """A roof that Mitsuba merges with the floor, a sky, and a lamp under the roof: the lamp lights
+    (its shadow rays end), the sky does not (its shadow rays do not end before the roof)."""
+    T = mi.ScalarTransform4f()
+    sides = {f"side_{z}": {"type": "rectangle", "to_world": T.translate([0, 0, z]).scale(100),
+                           "bsdf": {"type": "twosided", "bsdf": diffuse()}} for z in (0, 5)}
+    camera = sensor(to_world=lookat([0, -4, 1.2], [0, 0, 0], [0, 0, 1]), film=film(8, 8), fov=20.0)
+    thing = {"type": "sphere", "radius": 0.1, "center": [0, 0, 3]}
+    if moves:
+        thing = {"type": "moving", "translate": [0.1, 0, 0], "thing": thing}
+    lamp = {"type": "rectangle", "to_world": T.translate([0, 0, 4]).rotate([1, 0, 0], 180),
+            "emitter": {"type": "area", "radiance": 3.0}}  # fmt: skip
+
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 2})
+
+    def mean(**lights: dict) -> float:
+        scene = mi.load_dict({"type": "scene", "sensor": camera, **sides, "thing": thing, **lights})
+        return batches(scene, integrator, 64, [1]).mean()
+
+    sky = {"type": "constant"}
+    assert mean(sky=sky) < 0.01
+    assert mean(sky=sky, lamp=lamp) == pytest.approx(mean(lamp=lamp), rel=0.1)
