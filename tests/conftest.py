@@ -102,12 +102,12 @@ def _clean_up() -> None:
 @pytest.fixture
 def batches_of_sixteen_samples(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Per pixel of the scenes of :func:`make_scene`, in long renders, also where they learn."""
-    from mitsuba_ext.long_renders import integrator_batches
+    from mitsuba_ext.long_renders.integrator_batches import IntegratorBatches
     from mitsuba_ext.rendering import seed_passes
 
-    for table in (seed_passes._PASS_SAMPLES, integrator_batches._SAMPLES):
+    for table in (seed_passes._PASS_SAMPLES, IntegratorBatches.batch_samples):
         monkeypatch.setitem(table, dr.backend_v(mi.Float), 48 * 16)
-    monkeypatch.setattr(integrator_batches, "_LEARNING_SPP", 16)
+    monkeypatch.setattr(IntegratorBatches, "learning_spp", 16)
 
 
 # ---- Comparisons ----

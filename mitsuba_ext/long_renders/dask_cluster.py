@@ -17,9 +17,6 @@ from ..util.errors import InputError, InstallationError
 if TYPE_CHECKING:
     from distributed import Client
 
-#: The time limit for the scheduler to answer and for a first worker to connect, in seconds.
-_TIMEOUT = 10
-
 #: The time between two queries for the list of workers, in seconds.
 _PERIOD = 5.0
 
@@ -83,13 +80,17 @@ class DaskWorkers(Executor):
 
 
 @contextlib.contextmanager
-def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]]]:
+def dask_cluster(
+    address: str, timeout: float = 10
+) -> Iterator[tuple[DaskWorkers, Callable[[], None]]]:
     """A context with an executor that renders on a cluster, and a function that checks the
     connection. Call the function periodically: without the scheduler, results never arrive. At the
     end of the context, batches that have not started are cancelled.
 
     Args:
         address: The address of the scheduler: ``tcp://host:port``.
+        timeout: The time limit for the scheduler to answer and for a first worker to connect, in
+            seconds.
 
     Raises:
         InputError: No scheduler answers, or it has no workers. The function also raises it if the
@@ -103,7 +104,7 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
             "--dask needs the package distributed: pip install 'mitsuba_ext[dask]'"
         ) from error
     try:
-        client = Client(address, timeout=_TIMEOUT, set_as_default=False)
+        client = Client(address, timeout=timeout, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"{address}: no Dask scheduler answers ({error})") from error
 
@@ -118,7 +119,7 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with client:
         try:
-            client.wait_for_workers(1, timeout=_TIMEOUT)
+            client.wait_for_workers(1, timeout=timeout)
         except TimeoutError:
             raise InputError(f"{address}: the Dask scheduler has no workers") from None
         executor = DaskWorkers(client)

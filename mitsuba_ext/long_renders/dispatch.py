@@ -23,18 +23,14 @@ from .workers import WorkerKilledError
 #: The number of batches submitted at a time, per worker.
 QUEUE = 2
 
-#: The time between two checks of the submitted batches, in seconds.
-_PERIOD = 1.0
-
 #: The number of failures of a batch after which the render ends with an error: its own failures,
 #: and kills of its process from outside. A kill says little about the batch, but the memory that it
 #: needs may be the reason every time.
 _MAX_FAILURES, _MAX_KILLS = 3, 10
 
 #: The time after which a batch is late: the first number times the median time from submission to
-#: result, but at least the second number of seconds (a new worker loads the scene and compiles
-#: kernels). Before the first result, it is the third number of seconds.
-_LATE_FACTOR, _MIN_LATE, _FIRST_RESULT_LATE = 5.0, 60.0, 600.0
+#: result. Before the first result, it is the second number of seconds.
+_LATE_FACTOR, _FIRST_RESULT_LATE = 5.0, 600.0
 
 #: The number of recent results whose times give the median.
 _MEDIAN_COUNT = 101
@@ -72,7 +68,15 @@ class Dispatch:
             files.
         renderer: The renderer whose batches they render.
         workers: A function that returns the number of batches that the executor renders at a time.
+
+    Attributes:
+        period: The time between two checks of the submitted batches, in seconds.
+        min_late: The minimum time after which a batch is late, in seconds: a new worker loads the
+            scene and compiles kernels.
     """
+
+    period = 1.0
+    min_late = 60.0
 
     def __init__(
         self,
@@ -119,7 +123,7 @@ class Dispatch:
                 if not self._tasks:
                     return
                 try:
-                    future = self._finished.get(timeout=_PERIOD)
+                    future = self._finished.get(timeout=self.period)
                 except queue.Empty:
                     if is_stopped():
                         return
@@ -183,12 +187,12 @@ class Dispatch:
 
     def _give_late_ones(self, learned: bytes | None) -> None:
         now = time.monotonic()
-        if now - self._looked < _PERIOD:
+        if now - self._looked < self.period:
             return
         self._looked = now
         limit = _FIRST_RESULT_LATE
         if self._seconds:
-            limit = max(_MIN_LATE, _LATE_FACTOR * statistics.median(self._seconds))
+            limit = max(self.min_late, _LATE_FACTOR * statistics.median(self._seconds))
         for batch, task in self._tasks.items():
             # The limit doubles with each copy, because the batch may be slow rather than its worker
             if now - task.given > limit * 2**task.copies:

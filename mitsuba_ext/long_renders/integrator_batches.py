@@ -19,19 +19,12 @@ from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..util.errors import InputError
 from .state import Batch, BatchResult, image_shape
 
-#: The approximate number of samples in a batch of one of our integrators. Batches are this large
-#: because each traces its kernels and starts its Markov chains anew.
-_SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
-
 #: The minimum samples per pixel of a batch of one of our integrators: with an independent sampler,
 #: and with a stratified one.
 _MIN_SPP, _MIN_STRUCTURED_SPP = 16, 64
 
 #: A number of samples per pixel larger than in any batch.
 _LARGER_THAN_A_BATCH = 1 << 24
-
-#: The samples per pixel of the batch that learns for the others, if the render has that many.
-_LEARNING_SPP = 128
 
 
 class IntegratorBatches:
@@ -43,10 +36,18 @@ class IntegratorBatches:
     Attributes:
         sensor, seed: The sensor and the seed.
         learns: Whether the integrator learns a state that other batches can load.
+        batch_samples: By backend, the approximate number of samples in a batch of one of our
+            integrators. Batches are this large because each traces its kernels and starts its
+            Markov chains anew.
+        learning_spp: The samples per pixel of the batch that learns for the others, if the render
+            has that many.
 
     Raises:
         InputError: The variant is scalar.
     """
+
+    batch_samples = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
+    learning_spp = 128
 
     def __init__(
         self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int
@@ -73,10 +74,11 @@ class IntegratorBatches:
         """
         if can_render(self._integrator):
             return min(pass_length(self.sensor), spp)
-        limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
+        pixel_count = math.prod(film_extent(self.sensor.film()))
+        limit = self.batch_samples[dr.backend_v(mi.Float)] // pixel_count
         limit = max(limit, _MIN_SPP if is_independent(self.sensor) else _MIN_STRUCTURED_SPP)
         if teaches:
-            limit = max(limit, _LEARNING_SPP)
+            limit = max(limit, self.learning_spp)
         return min(sample_count(self.sensor, 1 << (limit.bit_length() - 1)), spp)
 
     def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:

@@ -47,7 +47,7 @@ def main(variant: str | None = None) -> int:
         ("LLVM", _llvm),
         ("Variants", _variants),
         ("Plugins", _plugins),
-        ("Tiny renders", lambda: _renders(variant or _default_variant())),
+        ("Tiny renders", lambda: tiny_renders(variant or _default_variant())),
     ]
     healthy = True
     for title, part in parts:
@@ -146,7 +146,7 @@ def _plugins() -> Iterator[str]:
         yield f"{kind}: {', '.join(names) or 'none'}"
 
 
-def _renders(variant: str) -> Iterator[str]:
+def tiny_renders(variant: str) -> Iterator[str]:
     """One line per integrator. If an integrator crashes, a new process renders the rest.
     """
     from .registry import plugin_names

@@ -82,8 +82,8 @@ def _raise(*_: object) -> np.ndarray:
          "black", "nan_of_path", "path_raises"],
 )  # fmt: skip
 def test_verdict(monkeypatch, tmp_path: Path, path, ours, status, what, is_noisy) -> None:
-    monkeypatch.setattr(Trial, "_images_of_path", path)
-    monkeypatch.setattr(Trial, "_ours", ours)
+    monkeypatch.setattr(Trial, "images_of_path", path)
+    monkeypatch.setattr(Trial, "images", ours)
     verdict = Trial("plain", 0, tmp_path).verdict("neepp")
     assert (verdict.status, verdict.is_noisy) == (status, is_noisy), verdict
     assert what in verdict.what

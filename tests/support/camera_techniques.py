@@ -6,11 +6,9 @@ from typing import Any
 
 from tests.support.furnaces import FURNACES
 from tests.support.hard_cases import HARD_CASES
-from tests.support.technique import DEPTHS, SCENES, Checks, Technique
+from tests.support.technique import DEPTHS, EVERY_VARIANT, SCENES, Checks, Technique
 
-EVERYTHING = Checks(
-    SCENES, ("llvm_ad_mono", "llvm_ad_spectral"), FURNACES, DEPTHS, tuple(HARD_CASES)
-)
+EVERYTHING = Checks(SCENES, EVERY_VARIANT, FURNACES, DEPTHS, tuple(HARD_CASES))
 
 #: Furnaces with specular surfaces, unequal walls, or lamps.
 _NOT_DIFFUSE = ("furnace_glass", "furnace_isothermal", "furnace_lamps")
@@ -52,7 +50,7 @@ def _slow_neepp(scene: str, **parameters: Any) -> Technique:
 CAMERA_TECHNIQUES: dict[str, Technique] = {
     "composed_path": Technique(
         "composed_path", is_plugin=True, draws_like_path=True,
-        checks=Checks(SCENES, EVERYTHING.variants, FURNACES, [2, -1], HARD_CASES),
+        checks=Checks(SCENES, EVERY_VARIANT, FURNACES, [2, -1], HARD_CASES),
         thorough=EVERYTHING,
     ),
     "neepp": Technique(

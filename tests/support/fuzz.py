@@ -120,7 +120,7 @@ class Trial:
         """The status, the fault, and the relative standard error."""
         reference = self._path(1)
         try:
-            images = self._ours(name, 1)
+            images = self.images(name, 1)
             # Single wavelengths are outside of the gamut
             is_negative = images.min() < 0 and not mi.is_spectral
             if is_negative or not np.isfinite(images).all():
@@ -130,7 +130,7 @@ class Trial:
                 return FAILED, f"images of shape {shapes}", 0.0
             z = self._score(images, reference)
             if z >= _SUSPICIOUS:
-                reference, images = self._path(_MORE), self._ours(name, _MORE)
+                reference, images = self._path(_MORE), self.images(name, _MORE)
                 again = self._score(images, reference)
                 if not again < sidak(_COMPARISONS * regions(images).shape[1]):
                     means = f"{images.mean():.5g} instead of {reference.mean():.5g}"
@@ -162,7 +162,7 @@ class Trial:
         """So many times the usual number of images of ``path``."""
         if times not in self._reference:
             try:
-                self._reference[times] = self._images_of_path(times)
+                self._reference[times] = self.images_of_path(times)
             except RuntimeError as error:
                 self._reference[times] = CannotTellError(f"path: {_line(error)}")
         images = self._reference[times]
@@ -172,7 +172,7 @@ class Trial:
             raise CannotTellError("pixels of path are not finite")
         return images
 
-    def _images_of_path(self, times: int) -> np.ndarray:
+    def images_of_path(self, times: int) -> np.ndarray:
         count, strata = times * _REFERENCE_SEEDS, self._kind.strata
         integrator = replace(REFERENCE, plugin=self._kind.reference).make(**self._depth)
         rng = self._rng("path", times)
@@ -186,7 +186,7 @@ class Trial:
         ]
         return np.stack(images).reshape(count, strata, *images[0].shape[1:]).mean(axis=1)
 
-    def _ours(self, name: str, times: int) -> np.ndarray:
+    def images(self, name: str, times: int) -> np.ndarray:
         if TECHNIQUES[name].makes_splats and _has_beams(
             self._kind.make(self.number, self._folder, None)
         ):

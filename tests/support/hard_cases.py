@@ -21,18 +21,18 @@ from tests.support.hidden_lights import (
 )
 from tests.support.stage import (
     Scene,
-    _octahedron,
-    _translated,
     area,
     bitmap,
     diffuse,
     film,
     lookat,
     mesh,
+    octahedron,
     rectangle,
     rgb,
     sensor,
     stage,
+    translated,
 )
 
 
@@ -81,7 +81,7 @@ def _many_lights() -> Scene:
 
 
 def _hidden_light() -> Scene:
-    box = {"type": "cube", "to_world": _translated(0, 0, 9).scale(0.6), "bsdf": diffuse(0.0)}
+    box = {"type": "cube", "to_world": translated(0, 0, 9).scale(0.6), "bsdf": diffuse(0.0)}
     lamp = {"type": "sphere", "center": [0, 0, 9], "radius": 0.2, "emitter": area(5.0)}
     return stage(light=lamp, box=box)
 
@@ -154,19 +154,19 @@ def _materials() -> Scene:
     }
     things = {}
     for i, (name, bsdf) in enumerate(bsdfs.items()):
-        place = _translated(0.5 * (i % 4) - 0.75, 0, 0.35 + 0.6 * (i // 4)).scale(0.2)
+        place = translated(0.5 * (i % 4) - 0.75, 0, 0.35 + 0.6 * (i // 4)).scale(0.2)
         things[name] = {"type": "sphere", "to_world": place, "bsdf": bsdf}
     # Seen from behind, where Mitsuba's samples of rough metal are not finite
     metal = {"type": "roughconductor", "alpha": 0.3}
     rust = {"type": "blendbsdf", "weight": 0.7, "metal": metal, "rust": diffuse()}
-    place = _translated(0, -0.4, 0.7).rotate([1, 0, 0], -60).scale([0.2, 0.3, 1])
+    place = translated(0, -0.4, 0.7).rotate([1, 0, 0], -60).scale([0.2, 0.3, 1])
     things["rust"] = {"type": "disk", "to_world": place, "bsdf": rust}
     return stage(block=None, **things)
 
 
 def _closed_box() -> Scene:
     """The camera and the lamp are inside; nothing leaves."""
-    room = {"type": "cube", "to_world": _translated(0, 0, 1).scale(5), "flip_normals": True}
+    room = {"type": "cube", "to_world": translated(0, 0, 1).scale(5), "flip_normals": True}
     return stage(room={**room, "bsdf": diffuse(0.4)}, wall=None)
 
 
@@ -174,12 +174,12 @@ def _instances() -> Scene:
     group = {
         "type": "shapegroup",
         "ball": {"type": "sphere", "radius": 0.25, "bsdf": diffuse()},
-        "gem": _octahedron(0.2, (0, 0, 0.4), bsdf=diffuse(0.2)),
+        "gem": octahedron(0.2, (0, 0, 0.4), bsdf=diffuse(0.2)),
     }
     places = {
         f"instance_{i}": {
             "type": "instance",
-            "to_world": _translated(i - 1.5, 0, 0.4),
+            "to_world": translated(i - 1.5, 0, 0.4),
             "group": {"type": "ref", "id": "group"},
         }
         for i in range(4)
@@ -208,7 +208,7 @@ def _light_without_area() -> Scene:
 
 def _medium() -> Scene:
     fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 2.0}
-    cloud = {"type": "cube", "to_world": _translated(-0.4, 0, 0.6).scale(0.4), "interior": fog}
+    cloud = {"type": "cube", "to_world": translated(-0.4, 0, 0.6).scale(0.4), "interior": fog}
     return stage(cloud={**cloud, "bsdf": {"type": "null"}})
 
 
@@ -239,7 +239,7 @@ HARD_CASES: dict[str, HardCase] = {
     # There, rays of Mitsuba's `path` start behind what is near
     "scaled_by_1e-3": HardCase(lambda: _scaled(1e-3), truth=stage),
     "scaled_by_1e4": HardCase(lambda: _scaled(1e4)),
-    "moved_by_1e3_sizes": HardCase(lambda: stage(_translated(3e3, -2e3, 1e3))),
+    "moved_by_1e3_sizes": HardCase(lambda: stage(translated(3e3, -2e3, 1e3))),
     "radiance_1e-4": HardCase(lambda: stage(radiance=1e-4)),
     "radiance_1e6": HardCase(lambda: stage(radiance=1e6)),
     "lamp_of_radius_1e-4": HardCase(lambda: _small_lamp(1e-4)),
@@ -252,7 +252,7 @@ HARD_CASES: dict[str, HardCase] = {
         lambda: stage(light={"type": "directional", "direction": [0.2, 0.4, -1]})
     ),
     "directional_area_light": HardCase(
-        lambda: stage(light=rectangle(_translated(0, 0, 3).rotate([1, 0, 0], 180),
+        lambda: stage(light=rectangle(translated(0, 0, 3).rotate([1, 0, 0], 180),
                                       emitter={"type": "directionalarea"})),
         is_black=True,  # only paths from the light find it
     ),  # fmt: skip
@@ -261,7 +261,7 @@ HARD_CASES: dict[str, HardCase] = {
     "sky_through_portals": HardCase(_sky_through_portals),
     "textured_two_sided_lights": HardCase(_textured_two_sided_lights),
     "smooth_normal_lamp": HardCase(
-        lambda: stage(light=_octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0)))
+        lambda: stage(light=octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0)))
     ),
     "materials": HardCase(_materials),
     "mirror_ring": HardCase(mirror_ring, precision=0.03),

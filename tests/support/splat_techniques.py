@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.support.furnaces import FURNACES
 from tests.support.hard_cases import HARD_CASES
-from tests.support.technique import DEPTHS, SCENES, Checks, Technique
+from tests.support.technique import DEPTHS, EVERY_VARIANT, SCENES, Checks, Technique
 
 _NOT_DIFFUSE = ("furnace_glass", "furnace_isothermal", "furnace_lamps")
 _GLASS_AND_ISOTHERMAL = ("furnace_glass", "furnace_isothermal")
@@ -37,9 +37,9 @@ SPLAT_TECHNIQUES: dict[str, Technique] = {
     # ``test_bdpt.py`` and ``test_light_tracer.py`` have emitters, materials and sensors
     "bdpt": Technique(
         "bdpt", is_plugin=True, makes_splats=True,
-        checks=Checks(["cornell_box"], cases=["no_light"]),
+        checks=Checks(["cornell_box"], cases=["no_light", "instances", "thin_lens"]),
         thorough=Checks(
-            ["mirrors_and_glass", "sunny_gloss", "window"], ["llvm_ad_spectral"], FURNACES,
+            ["mirrors_and_glass", "sunny_gloss", "window"], EVERY_VARIANT, FURNACES,
             [2, -1], _LIGHT_PATHS,
         ),
     ),
@@ -87,9 +87,9 @@ SPLAT_TECHNIQUES: dict[str, Technique] = {
     ),
     "light_tracer": Technique(
         "light_tracer", is_plugin=True, makes_splats=True,
-        checks=Checks(cases=["no_light"]),
+        checks=Checks(cases=["no_light", "max_depth_unlimited"]),
         thorough=Checks(
-            ["rooms"], ["llvm_ad_spectral"],
+            ["rooms"], EVERY_VARIANT,
             [name for name in FURNACES if name not in _UNSEEN_FROM_LIGHTS], [2, -1],
             [case for case in _LIGHT_PATHS if case not in _UNSEEN_FROM_LIGHTS],
         ),
@@ -104,7 +104,7 @@ SPLAT_TECHNIQUES: dict[str, Technique] = {
             cases=("no_light", "light_that_nothing_sees", "materials", "one_sample"),
         ),
         thorough=Checks(
-            SCENES, ["llvm_ad_mono", "llvm_ad_spectral"], FURNACES, DEPTHS, _OF_CHAINS,
+            SCENES, EVERY_VARIANT, FURNACES, DEPTHS, _OF_CHAINS,
         ),
     ),
     # No camera samples: chains find all light

@@ -99,7 +99,7 @@ def stage(
     return {key: value for key, value in scene.items() if value not in (None, {})}
 
 
-def _translated(x: float, y: float, z: float) -> mi.ScalarTransform4f:
+def translated(x: float, y: float, z: float) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().translate([x, y, z])
 
 
@@ -120,7 +120,7 @@ def mesh(vertices: list, faces: list, normals: list | None = None, **children: A
     return shape
 
 
-def _octahedron(radius: float, centre: tuple[float, float, float], **children: Any) -> mi.Mesh:
+def octahedron(radius: float, centre: tuple[float, float, float], **children: Any) -> mi.Mesh:
     """With smooth vertex normals: shading and geometric normals differ by up to 55 degrees."""
     corners = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]

@@ -20,7 +20,11 @@ SCENES: dict[str, tuple[int, int]] = {
     "window": (3, 256),
 }
 
+#: Values of ``max_depth`` for the furnaces.
 DEPTHS = (1, 2, 3, 6, -1)
+
+#: The variants in which means are compared, besides ``llvm_ad_rgb``.
+EVERY_VARIANT = ("llvm_ad_mono", "llvm_ad_spectral")
 
 
 @dataclass(frozen=True)

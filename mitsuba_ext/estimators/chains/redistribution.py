@@ -23,10 +23,6 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found
 
-#: The maximum number of samples of a batch, without and with a time limit. Each batch starts new
-#: chains, and few chains do not keep the processor busy.
-_BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
-
 #: The saved totals over all batches, besides the image.
 _TOTALS = ("samples", "batches", "redistributed", "energy")
 
@@ -83,7 +79,13 @@ class RedistributionRender(ChainRender):
     Parameters:
         settings: The parameters of energy redistribution.
         render: The parameters of :class:`ChainRender`.
+
+    Attributes:
+        max_batch, max_timed_batch: The maximum number of samples of a batch, without and with a
+            time limit. Each batch starts new chains, and few chains do not keep the processor busy.
     """
+
+    max_batch, max_timed_batch = 1 << 22, 1 << 19
 
     def __init__(self, settings: RedistributionSettings, *render: Any) -> None:
         super().__init__(*render)
@@ -111,7 +113,8 @@ class RedistributionRender(ChainRender):
         if stored:
             self._restore(stored, image)
         left = max(0, self._spp * self._pixel_count - self._samples)
-        size = min(left, _TIMED_BATCH if self._integrator.timeout > 0 else _BATCH)
+        is_timed = self._integrator.timeout > 0
+        size = min(left, self.max_timed_batch if is_timed else self.max_batch)
 
         def act(most: int) -> int:
             self._batch(image, rules, size, deposit)

@@ -39,10 +39,6 @@ _BOOTSTRAP_TIME, _SPEED_SAMPLES = 0.2, 1 << 16
 #: The relative standard error of the brightness above which there is a warning.
 _MAX_BRIGHTNESS_ERROR = 0.05
 
-#: The number of consecutive visits of a chain to a state above which there is a warning: an
-#: absolute number, and a fraction of the visits of an average pixel; both must be exceeded.
-_LONG_STAY, _LONG_STAY_FRACTION = 64, 0.5
-
 #: The number of samples that estimate the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
 
@@ -94,7 +90,14 @@ class MetropolisRender(ChainRender):
     Parameters:
         settings: The parameters of the chains.
         render: The parameters of :class:`ChainRender`.
+
+    Attributes:
+        long_stay, long_stay_fraction: The number of consecutive visits of a chain to a state above
+            which there is a warning: an absolute number, and a fraction of the visits of an average
+            pixel; both must be exceeded.
     """
+
+    long_stay, long_stay_fraction = 64, 0.5
 
     def __init__(self, settings: ChainSettings, *render: Any) -> None:
         super().__init__(*render)
@@ -247,7 +250,7 @@ class MetropolisRender(ChainRender):
             f"{self._rates()}; brightness known to {start.error:.1%}; a chain stayed at one path "
             f"for {longest:.0f} of {chains.done} mutations"
         )
-        if longest > max(_LONG_STAY, _LONG_STAY_FRACTION * mutations / self._pixel_count):
+        if longest > max(self.long_stay, self.long_stay_fraction * mutations / self._pixel_count):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"A chain stayed at one path for {longest:.0f} of {chains.done} mutations: some "

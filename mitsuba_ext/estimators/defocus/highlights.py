@@ -23,8 +23,8 @@ _MIN_CONTRAST = 3.0
 #: the lens handles smaller ones.
 _MIN_RADIUS = 2.0
 
-#: The maximum number of pixels that all highlights together cover, per pixel of the image.
-_MAX_COVERED = 8
+#: The maximum number of pixels that all highlights of a layer cover, per pixel of the image.
+MAX_COVERED = 8
 
 #: A function of the indices of pixels, their centres, and points of the lens that returns the
 #: transmittance of layers.
@@ -47,7 +47,7 @@ class Highlights:
 
 
 def without_highlights(
-    layer: Layer, around: Pyramid, size: Size
+    layer: Layer, around: Pyramid, size: Size, max_covered: float = MAX_COVERED
 ) -> tuple[mi.Float, Highlights | None]:
     """Divides a layer into its colours without highlights, and the highlights (``None`` if there
     are none). With gathering alone, the 48 lens points of one pixel would hit a bright pixel, and
@@ -56,7 +56,9 @@ def without_highlights(
     Parameters:
         layer: The layer.
         around: The pyramid of the sum of all layers.
-        size: The size of the image. """
+        size: The size of the image.
+        max_covered: The maximum number of pixels that the highlights cover, per pixel of the image.
+    """
     glow = layer.glow if layer.glow is not None else layer.blur
     found = dr.compress(_Pixels(layer, glow, around, size, size.pixels()[0]).is_bright())
     if len(found) == 0:
@@ -68,7 +70,7 @@ def without_highlights(
     is_shared = pixels.blur > dr.opaque(mi.Float, layer.shared)
     radius, blur = dr.select(is_shared, 0, pixels.radius), pixels.blur
     dr.eval(excess, radius, blur)
-    spread_ones = _affordable(excess, radius, size)
+    spread_ones = _affordable(excess, radius, max_covered * size.count)
     is_gone = dr.select(is_shared, mi.Float(1), 0)
     if len(spread_ones) > 0:
         dr.scatter(is_gone, mi.Float(1), spread_ones)
@@ -133,15 +135,15 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
     dr.eval(picture)
 
 
-def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
+def _affordable(excess: mi.Color3f, radius: mi.Float, limit: float) -> mi.UInt32:
     """The indices of the highlights to spread, out of the highlights with a radius above 0: if
-    these would cover too many pixels, the ones with the largest brightness per covered pixel."""
+    these would cover more than ``limit`` pixels, the ones with the largest brightness per pixel."""
     covered = math.pi * np.square(radius.numpy())
     order = np.flatnonzero(covered)
-    if covered.sum() > _MAX_COVERED * size.count:
+    if covered.sum() > limit:
         bright = dr.sum(excess).numpy()
         order = order[np.argsort(-bright[order] / covered[order], kind="stable")]
-        order = order[np.cumsum(covered[order]) <= _MAX_COVERED * size.count]
+        order = order[np.cumsum(covered[order]) <= limit]
     return from_numpy(mi.UInt32, np.sort(order))
 
 

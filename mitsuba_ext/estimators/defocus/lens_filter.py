@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...util.arrays import from_numpy
-from .highlights import Highlights, Visibility, spread, without_highlights
+from .highlights import MAX_COVERED, Highlights, Visibility, spread, without_highlights
 from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
@@ -39,7 +39,7 @@ _OPAQUE = 0.9999
 _MARGIN = 2.0
 
 
-def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
+def lens_filter(layers: list[Layer], size: Size, max_covered: float = MAX_COVERED) -> mi.Color3f:
     """The image of layers through a thin lens.
 
     Each of 48 points of the lens sees each layer shifted. For each point separately, a layer covers
@@ -53,29 +53,30 @@ def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
     Parameters:
         layers: The layers, nearest first.
         size: The size of the images.
+        max_covered: The maximum number of pixels that the highlights of a layer cover, per pixel.
     """
-    return _LensFilter(layers, size).picture()
+    return _LensFilter(layers, size, max_covered).picture()
 
 
 class _LensFilter:
-    def __init__(self, layers: list[Layer], size: Size) -> None:
+    def __init__(self, layers: list[Layer], size: Size, max_covered: float) -> None:
         self._size, self._layers = size, list(layers)
         self._lens = LensPoints(ring_points())
         self._few = [_Points(rings) for _radius, rings in _FEW_POINTS] + [_Points(RINGS)]
         self._pyramids = [Pyramid(layer.color, size) for layer in layers]
         self._highlights: list[tuple[int, Highlights]] = []
-        self._take_highlights()
+        self._take_highlights(max_covered)
         dr.eval([layer.blur for layer in layers])
         self._is_flat = [_range(layer.blur) <= _EQUAL_BLURS for layer in layers]
 
-    def _take_highlights(self) -> None:
+    def _take_highlights(self, max_covered: float) -> None:
         """Moves highlights from the layers to ``_highlights``. Once the brightest ones are gone,
         their edges stand out, and are found in a second pass."""
         layers = self._layers
         for _ in range(_ROUNDS):
             around, before = reduce(Pyramid.plus, self._pyramids), len(self._highlights)
             for k, layer in enumerate(layers):
-                color, highlights = without_highlights(layer, around, self._size)
+                color, highlights = without_highlights(layer, around, self._size, max_covered)
                 if color is not layer.color:
                     layers[k] = replace(layer, color=color)
                     self._pyramids[k] = Pyramid(color, self._size)

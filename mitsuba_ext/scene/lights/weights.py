@@ -24,7 +24,7 @@ _VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
 #: The approximate number of evaluations of all cells in all rows, within these bounds, and again
 #: for the brighter cells.
-_EVALUATIONS = 1 << 22
+EVALUATIONS = 1 << 22
 
 #: Added to the cosine at a surface because its shading normal may differ from the geometric one.
 _ADDED_COSINE = 0.02
@@ -87,7 +87,7 @@ def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.F
         p, time = rows.sample(row, sampler)
         return _light(cells, cell, p, time, sampler)[0]
 
-    means = _means(rows.count - 1, cells.count, _VOXEL_POINTS, arrives)
+    means = cell_means(rows.count - 1, cells.count, _VOXEL_POINTS, arrives)
     return _with_last_row(scene, cells, means)
 
 
@@ -106,7 +106,7 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
         # In double precision: the square of a bright light may exceed the range of single precision
         return dr.square(mi.Float64(value * cosine))
 
-    means = _means(rows.count - 1, cells.count, _SURFACE_POINTS, squared_contribution)
+    means = cell_means(rows.count - 1, cells.count, _SURFACE_POINTS, squared_contribution)
     return _with_last_row(scene, cells, mi.Float(dr.sqrt(means)))
 
 
@@ -123,11 +123,12 @@ def _light(
     return dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, lanes)), ds.d
 
 
-def _means(
+def cell_means(
     rows: int,
     cells: int,
     bounds: tuple[int, int],
     measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float | mi.Float64],
+    evaluations: int = EVALUATIONS,
 ) -> mi.Float | mi.Float64:
     """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape [rows
     · cells]. If the budget does not allow the maximum number of samples for all cells, the cells
@@ -135,21 +136,22 @@ def _means(
 
     Parameters:
         bounds: The minimum and the maximum number of samples of a cell in a row.
+        evaluations: The budget: the approximate number of evaluations of ``measure``.
     """
     pairs = dr.arange(mi.UInt32, rows * cells)
-    samples = _sample_count(len(pairs), bounds)
+    samples = _sample_count(len(pairs), bounds, evaluations)
     means = _means_of(pairs, cells, samples, measure)
     if samples < bounds[1]:
         row_mean = dr.repeat(dr.block_sum(means, cells), cells) / cells
         important = dr.compress(means > row_mean)
-        more = _sample_count(len(important), bounds)
+        more = _sample_count(len(important), bounds, evaluations)
         if len(important) > 0 and more > samples:
             dr.scatter(means, _means_of(important, cells, more, measure), important)
     return means
 
 
-def _sample_count(pairs: int, bounds: tuple[int, int]) -> int:
-    return max(bounds[0], min(bounds[1], _EVALUATIONS // max(1, pairs)))
+def _sample_count(pairs: int, bounds: tuple[int, int], evaluations: int) -> int:
+    return max(bounds[0], min(bounds[1], evaluations // max(1, pairs)))
 
 
 def _means_of(

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.compare import InputError, read_exr
-from mitsuba_ext.long_renders import dask_cluster, dispatch
+from mitsuba_ext.long_renders import dask_cluster
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
+from mitsuba_ext.long_renders.dispatch import Dispatch
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import RenderState
 from tests.support.command_line import in_subprocess
@@ -154,7 +155,7 @@ def test_workers_without_the_files_render_what_is_learned_once(
 
 @pytest.mark.slow
 def test_a_worker_that_hangs_costs_its_batches_only(make_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(dispatch, "_MIN_LATE", 5.0)
+    monkeypatch.setattr(Dispatch, "min_late", 5.0)
     request = RenderRequest(str(make_scene()), (64, 64))
     hanging = []
     with _cluster(tmp_path, 2) as (address, workers):
@@ -194,9 +195,8 @@ def test_a_scheduler_that_ends_is_named_in_a_sentence(make_scene, tmp_path, numb
 
 
 @pytest.mark.slow
-def test_a_cluster_that_is_not_there_is_named(monkeypatch):
+def test_a_cluster_that_is_not_there_is_named():
     pytest.importorskip("distributed")
-    monkeypatch.setattr(dask_cluster, "_TIMEOUT", 1)
     with pytest.raises(InputError, match="no Dask scheduler answers"):
-        with dask_cluster.dask_cluster("tcp://127.0.0.1:1"):
+        with dask_cluster.dask_cluster("tcp://127.0.0.1:1", timeout=1):
             pass

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.compare import InputError, SceneChanges, load_scene, render_reference
-from mitsuba_ext.long_renders import dispatch, tasks
+from mitsuba_ext.long_renders import tasks
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.bundle import Bundle
+from mitsuba_ext.long_renders.dispatch import Dispatch
 from mitsuba_ext.long_renders.divided_references import ReferenceWorkers
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import Batch, RenderState
@@ -227,8 +228,8 @@ def test_what_is_learned_is_sent_to_workers_that_lack_it(scenes):
 
 
 def test_a_late_batch_is_given_to_another_worker_and_counts_once(make_scene, monkeypatch):
-    monkeypatch.setattr(dispatch, "_PERIOD", 0.05)
-    monkeypatch.setattr(dispatch, "_MIN_LATE", 0.4)
+    monkeypatch.setattr(Dispatch, "period", 0.05)
+    monkeypatch.setattr(Dispatch, "min_late", 0.4)
     request = RenderRequest(str(make_scene()))
     here = rendered(request, 96)
 

@@ -41,11 +41,11 @@ def test_process_that_says_nothing_is_an_error(monkeypatch):
 
 
 def test_report_tells_which_copy_of_the_package_runs(monkeypatch, run):
-    monkeypatch.setattr(doctor, "_renders", lambda _variant: iter(["neepp: fine"]))
+    monkeypatch.setattr(doctor, "tiny_renders", lambda _variant: iter(["neepp: fine"]))
     code, out, _ = run("doctor")
     folder = Path(mitsuba_ext.__file__).parent
     assert f"mitsuba_ext {mitsuba_ext.__version__} ({folder})" in out
     assert (code, "Everything works." in out) in ((0, True), (1, False))
-    monkeypatch.setattr(doctor, "_renders", lambda _variant: iter(["! neepp: trouble"]))
+    monkeypatch.setattr(doctor, "tiny_renders", lambda _variant: iter(["! neepp: trouble"]))
     code, out, _ = run("doctor")
     assert code == 1 and "Lines that start with ! need attention." in out

@@ -1,4 +1,4 @@
-"""``bdpt`` shows the image of ``path``."""
+"""``bdpt`` shows the image of ``path``: emitters, materials, sensors, parameters."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from tests.support.emitters_and_materials import (
     below_the_lamp,
     stage_with_ball,
 )
-from tests.support.hard_cases import _delta_lights, _instances
-from tests.support.stage import _octahedron, area, diffuse, film, rectangle, sensor, stage
+from tests.support.stage import area, diffuse, film, octahedron, rectangle, stage
 from tests.support.statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
@@ -59,7 +58,7 @@ def test_beams_and_lamps_of_any_texture_light_the_same_scene(name: str) -> None:
 @pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
 def test_a_lamp_with_interpolated_normals_sends_out_what_camera_rays_see(name: str) -> None:
     """Where next event estimation of ``path`` errs."""
-    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))
+    lamp = octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))
     scene = mi.load_dict(stage(light=lamp, camera=below_the_lamp()), optimize=False)
     by_hits = mi.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
     integrator = mi.load_dict({"type": name, "max_depth": 2})
@@ -78,19 +77,15 @@ def test_caustics_are_those_of_path(kind: str) -> None:
     assert_image_of_path(stage_with_ball({"type": kind}), 5, precision=0.01)
 
 
-def test_instances_of_a_group_with_several_shapes_are_read_back_as_they_are() -> None:
-    assert_image_of_path({**_instances(), "sensor": below_the_lamp()}, 3, 512)
-
-
 CAMERAS = {
-    "thinlens": {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
     "orthographic": {"plugin": "orthographic"},
     "cropped": {"film": film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13,
                              crop_height=11, rfilter={"type": "gaussian"})},
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", some("thinlens", of=CAMERAS))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CAMERAS)
 def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
     camera = below_the_lamp(**CAMERAS[name])
     if name == "orthographic":
@@ -122,10 +117,8 @@ def test_parameters_do_not_change_the_mean(name: str) -> None:
                          **PARAMETERS[name])  # fmt: skip
 
 
-@pytest.mark.parametrize("max_depth", some(-1, of=[1, 2, 3, -1]))
-def test_paths_are_as_long_as_those_of_path(max_depth: int) -> None:
-    scene = stage() if max_depth == 1 else stage(camera=below_the_lamp())
-    assert_image_of_path(scene, max_depth, precision=0.03, both={"rr_depth": 2})
+def test_early_roulette_keeps_the_mean_of_paths_of_any_length() -> None:
+    assert_image_of_path(stage(camera=below_the_lamp()), -1, precision=0.03, both={"rr_depth": 2})
 
 
 @pytest.mark.slow
@@ -136,15 +129,9 @@ def test_hidden_emitters_are_looked_through() -> None:
 
 
 @pytest.mark.slow
-def test_points_and_directions_of_light_agree() -> None:
-    assert_image_of_path(_delta_lights(), precision=0.01)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
-@pytest.mark.parametrize("connections", [1, 3])
-def test_variants_show_the_image_of_path(variant: str, connections: int) -> None:
-    assert_image_of_path(stage(camera=below_the_lamp()), connections=connections)
+def test_three_connections_in_other_variants_show_the_image_of_path(variant: str) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp()), connections=3)
 
 
 @pytest.mark.slow
@@ -182,12 +169,6 @@ def test_a_pass_traces_each_walk_once() -> None:
         kernels = [k for k in dr.kernel_history() if k.get("operation_count", 0) > 500]
     # Emission, all rounds of the light walk, the camera walk
     assert len({k["hash"] for k in kernels if k["size"] == lanes}) == 3
-
-
-def test_the_same_seed_gives_the_same_image() -> None:
-    scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=4.0)))
-    first, second = (batches(scene, bdpt(), 32, [7])[0] for _ in range(2))
-    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5 * first.mean())
 
 
 @pytest.mark.parametrize("shape", ["bsplinecurve", "sdfgrid"])

@@ -13,6 +13,7 @@ import pytest
 from mitsuba_ext.estimators.chains.bootstrap import Bootstrap
 from mitsuba_ext.estimators.chains.chain_image import ChainImage
 from mitsuba_ext.estimators.chains.looped import LoopedChains
+from mitsuba_ext.estimators.chains.redistribution import RedistributionRender
 from tests.support.chain_integrators import GLASS_BALL, erpt
 from tests.support.chain_targets import TARGETS
 from tests.support.stage import area, sensor, stage
@@ -120,14 +121,6 @@ def test_samples_start_as_many_chains_as_they_hold_energies() -> None:
     assert abs(np.mean(counts)) < THRESHOLD * np.std(counts, ddof=1) / 8
 
 
-@pytest.mark.parametrize("light", [{}, {"type": "point", "position": [0, 0, -5]}],
-                         ids=["none", "below the floor"])  # fmt: skip
-def test_an_image_without_light_is_black(light: dict[str, Any]) -> None:
-    integrator = erpt()
-    assert not batches(mi.load_dict(stage(light=light)), integrator, 16, [1]).any()
-    assert not integrator.statistics.interrupted
-
-
 def test_cancelling_leaves_a_sound_image() -> None:
     scene, integrator = mi.load_dict(stage(glass=GLASS_BALL)), erpt()
     integrator.progress = lambda fraction: integrator.cancel()
@@ -142,7 +135,7 @@ def test_an_error_amid_a_batch_leaves_the_batches_before_it(
 ) -> None:
     """Also a second Ctrl-C, in chains or in samples: half of a batch would not have the right
     mean."""
-    monkeypatch.setattr("mitsuba_ext.estimators.chains.redistribution._BATCH", 16 * 16 * 16)
+    monkeypatch.setattr(RedistributionRender, "max_batch", 16 * 16 * 16)
     scene, integrator = mi.load_dict(stage(glass=GLASS_BALL)), erpt(outliers=1.0, direct_samples=8)
     (expected,) = batches(scene, integrator, 16, [5])
     fails = LoopedChains if chains else ChainImage

@@ -233,16 +233,6 @@ def test_a_render_of_few_samples_makes_few_records() -> None:
     assert 0 < len(cache.records) <= 2 * 32 * 32 / 60
 
 
-def test_the_same_seed_gives_the_same_image() -> None:
-    scene = mi.load_dict(stage(camera=sensor(film=film(32, 32))), optimize=False)
-    images, counts = [], []
-    for _ in range(2):
-        cache = make(4, gather_samples=64)
-        images.append(np.array(mi.render(scene, integrator=cache, spp=4, seed=5)))
-        counts.append(len(cache.records))
-    assert counts[0] == counts[1] and images[0] == pytest.approx(images[1], rel=1e-5)
-
-
 @pytest.mark.slow
 def test_the_error_falls_with_the_accuracy() -> None:
     scene = mi.load_dict(stage(camera=sensor(film=film(32, 32))), optimize=False)

@@ -13,6 +13,7 @@ import pytest
 from mitsuba_ext.estimators.chains.looped import LoopedChains
 from mitsuba_ext.estimators.chains.numbers import generator
 from mitsuba_ext.estimators.chains.path_chains import PathChains
+from mitsuba_ext.estimators.chains.redistribution import RedistributionRender
 from mitsuba_ext.estimators.chains.stored import arrays_of, value_of
 from mitsuba_ext.estimators.chains.target import Contribution
 from mitsuba_ext.util.stored_arrays import StoredArrays
@@ -85,7 +86,7 @@ def test_renders_of_other_kinds_go_on_where_they_were_stopped(
     tmp_path: Path, which: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also those of chains of paths, and of batches."""
-    monkeypatch.setattr("mitsuba_ext.estimators.chains.redistribution._BATCH", 32**2)
+    monkeypatch.setattr(RedistributionRender, "max_batch", 32**2)
     monkeypatch.setattr(PathChains, "launch", 4)
     scene, file = mi.load_dict(stage()), tmp_path / "chains.npz"
 

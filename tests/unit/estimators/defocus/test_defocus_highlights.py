@@ -23,12 +23,14 @@ pytestmark = pytest.mark.usefixtures("variant")
 WIDTH, HEIGHT = 97, 81
 
 
-def picture_of(bright: np.ndarray, blur: np.ndarray, limits: list[float]) -> np.ndarray:
-    """The first channel of the picture that the lens makes of what shines, and is blurred so."""
+def picture_of(
+    bright: np.ndarray, blur: np.ndarray, limits: list[float], **options: float
+) -> np.ndarray:
+    """The first channel of the picture that the lens makes of a brightness and a blur per pixel."""
     size = Size(bright.shape[1], bright.shape[0])
     color, blurs = (mi.Float(x.ravel().astype(np.float32)) for x in (bright, blur))
     sums = sums_of_picture(mi.Color3f(color), blurs, Limits(limits))
-    picture = lens_filter(layers_from_sums(sums, size), size)
+    picture = lens_filter(layers_from_sums(sums, size), size, **options)
     return picture.x.numpy().reshape(bright.shape)
 
 
@@ -77,12 +79,11 @@ def test_a_lamp_is_seen_past_what_stands_before_it(step, share):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
-def test_more_highlights_than_are_affordable_keep_their_light(scale, monkeypatch):
+def test_more_highlights_than_are_affordable_keep_their_light(scale):
     bright = scale * np.random.default_rng(1).pareto(1.2, (HEIGHT, WIDTH))
     blurs = np.full((HEIGHT, WIDTH), -12.0)
     images = [picture_of(bright, blurs, [IN_FOCUS])]
-    monkeypatch.setattr(highlights, "_MAX_COVERED", 0.5)
-    images.append(picture_of(bright, blurs, [IN_FOCUS]))
+    images.append(picture_of(bright, blurs, [IN_FOCUS], max_covered=0.5))
     inner = slice(24, -24)
     for image in images:
         assert np.isfinite(image).all() and image.min() >= 0

@@ -27,7 +27,7 @@ from tests.support.bidirectional_paths import (
     weights_of_techniques,
 )
 from tests.support.emitters_and_materials import EMITTERS, MATERIALS, SPECULAR, T, stage_with_ball
-from tests.support.stage import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
+from tests.support.stage import area, diffuse, octahedron, rectangle, rgb, sensor, stage
 from tests.support.statistical import some
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -114,7 +114,7 @@ def test_weights_of_a_material_add_up(name: str) -> None:
 
 
 def test_weights_of_a_lamp_with_interpolated_normals_add_up() -> None:
-    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0))
+    lamp = octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0))
     scene = mi.load_dict(stage(light=lamp), optimize=False)
     assert_they_add_up(weights(scene, 1, 0, sampling_weights(scene))[0])
 

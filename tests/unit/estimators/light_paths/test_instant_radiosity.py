@@ -305,11 +305,6 @@ def test_statistics_tell_the_virtual_lights_and_the_bound() -> None:
     assert "virtual lights in a set, 2 sets" in learned and "bounded by" in learned
 
 
-def test_a_scene_without_light_is_black() -> None:
-    scene = mi.load_dict(stage(light={}), optimize=False)
-    assert not batches(scene, make(), 2, [1]).any()
-
-
 @pytest.mark.parametrize(("parameters", "words"), [
     ({"choice": "best"}, '"choice" is \'best\'; it must be one of uniform, power, clustered'),
     ({"light_paths": 0}, '"light_paths" is 0; it must be at least 1'),

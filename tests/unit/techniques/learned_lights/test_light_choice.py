@@ -9,9 +9,9 @@ import pytest
 
 from mitsuba_ext.planning.costs import SEGMENT, SHADOW, TABLE
 from mitsuba_ext.planning.learner import Pilot
-from mitsuba_ext.scene.lights import weights as lights_weights
 from mitsuba_ext.scene.lights.choice import Choice
 from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.scene.lights.weights import cell_means, uniform_weights
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
 from mitsuba_ext.transport.light_table import LightTable, OneRow
 from mitsuba_ext.transport.rejection_law import RejectionLaw
@@ -128,7 +128,7 @@ def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives()
 def test_the_default_of_a_divided_light_is_its_area():
     scene = floor(wide=lamp(0, 0, 1, size=1.0), small=lamp(0, 0, 0.5))
     cells = LightCells(scene, mi.Vector3f(0.5))
-    weights = lights_weights.uniform_weights(scene, cells).numpy()
+    weights = uniform_weights(scene, cells).numpy()
     assert cells.count > 4
     assert np.bincount(cells.emitter_index, weights) == pytest.approx(np.ones(2))
 
@@ -156,23 +156,21 @@ def test_expectations_of_extreme_lights_are_numbers(radiance: float):
 
 
 @pytest.mark.parametrize("evaluations, runs", [(1 << 22, 1), (200, 2)])
-def test_important_pairs_are_measured_again_as_themselves(monkeypatch, evaluations, runs):
-    monkeypatch.setattr(lights_weights, "_EVALUATIONS", evaluations)
+def test_important_pairs_are_measured_again_as_themselves(evaluations, runs):
     calls = []
 
     def measure(row, cell, sampler):
         calls.append(dr.width(row))
         return mi.Float(10 * row + cell)
 
-    means = lights_weights._means(10, 5, (2, 16), measure).numpy().reshape(10, 5)
+    means = cell_means(10, 5, (2, 16), measure, evaluations).numpy().reshape(10, 5)
     assert np.array_equal(means, 10 * np.arange(10)[:, None] + np.arange(5))
     assert len(calls) == runs
 
 
-def test_pairs_that_are_all_alike_are_not_measured_again(monkeypatch):
-    monkeypatch.setattr(lights_weights, "_EVALUATIONS", 200)
-    means = lights_weights._means(
-        50, 2, (2, 16), lambda row, cell, sampler: dr.full(mi.Float, 1, dr.width(row))
+def test_pairs_that_are_all_alike_are_not_measured_again():
+    means = cell_means(
+        50, 2, (2, 16), lambda row, cell, sampler: dr.full(mi.Float, 1, dr.width(row)), 200
     )
     assert (means.numpy() == 1).all()
 

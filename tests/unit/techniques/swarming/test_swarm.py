@@ -20,7 +20,6 @@ from tests.support.statistical import (
     assert_same_pixels_on_average,
     batches,
     load,
-    one_thread,
 )
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -130,15 +129,6 @@ def test_wrong_maps_only_make_noise(monkeypatch, adversary: str, kind: str) -> N
     expected = batches(scene, plain, 512, [1001, 1002])
     images = batches(scene, swarm(always_use=True, max_depth=depth), 1024, [1, 2])
     assert_same_pixels_on_average(images, expected, 0.08)
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_image() -> None:
-    integrator = swarm(always_use=True)
-    with one_thread():
-        a, b, other = batches(_streaks(), integrator, 16, [1, 1, 2])
-    np.testing.assert_array_equal(a, b)
-    assert np.abs(a - other).mean() > 0.01 * a.mean()
 
 
 @pytest.mark.parametrize("spp", [1, 3, 4])
