@@ -30,8 +30,8 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 #: ``MITSUBA_EXT_TEST_BACKEND=cuda`` runs the tests on a GPU.
 BACKEND = os.environ.get("MITSUBA_EXT_TEST_BACKEND", "llvm")
 
-# Background jobs of a shell ignore SIGINT, those of ``nohup`` SIGHUP, and so would the processes
-# that the tests interrupt
+# Background jobs of a shell ignore SIGINT, and jobs of ``nohup`` ignore SIGHUP: so would the
+# processes that the tests interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)

@@ -52,7 +52,7 @@ def _scene(name: str) -> mi.Scene:
 
 @functools.cache
 def _images_of_path(scene: str, variant: str, seeds: int) -> np.ndarray:
-    """Twice the usual samples, over so many seeds."""
+    """Twice the usual samples, divided between ``seeds`` seeds."""
     max_depth, spp = SCENES[scene]
     integrator = REFERENCE.make(max_depth)
     return batches(_scene(scene), integrator, 2 * spp // seeds, REFERENCE_SEEDS[:seeds])
@@ -76,9 +76,9 @@ def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 
 @pytest.mark.parametrize(
     ("scene", "name"), [case for case in pairs("scenes") if case.values[-1] not in FOLLOWERS]
 )
-def test_mean_is_that_of_path(scene: str, name: str) -> None:
-    """Also with grids that are much too coarse or much too fine, the law of the paper, rejection
-    that ignores what was learned, and other choices of lights."""
+def test_mean_agrees_with_path(scene: str, name: str) -> None:
+    """This includes grids that are much too coarse or much too fine, the law of the paper,
+    rejection that ignores what was learned, and other choices of lights."""
     _check_mean(scene, name)
 
 
@@ -87,7 +87,7 @@ def test_mean_is_that_of_path(scene: str, name: str) -> None:
     [case for case in pairs("variants") if case.values[-1] not in FOLLOWERS],
     indirect=["variant"],
 )
-def test_mean_is_that_of_path_in_variant(variant: str, name: str) -> None:
+def test_mean_agrees_with_path_in_variant(variant: str, name: str) -> None:
     _check_mean("cornell_box", name, variant)
 
 
@@ -103,7 +103,7 @@ def _means_of_path(scene: str) -> np.ndarray:
     # Images with splats always take many seeds
     [case for case in pairs("scenes") if not TECHNIQUES[case.values[-1]].makes_splats],
 )
-def test_mean_is_that_of_path_over_many_seeds(scene: str, name: str) -> None:
+def test_mean_agrees_with_path_over_many_seeds(scene: str, name: str) -> None:
     max_depth, spp = SCENES[scene]
     technique = TECHNIQUES[name]
     images = batches(_scene(scene), technique.make(max_depth), spp // 2, SEEDS)
@@ -156,19 +156,19 @@ def _assert_image_of_path(
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path(name: str, scene: str) -> None:
+def test_image_agrees_with_path(name: str, scene: str) -> None:
     max_depth, _ = SCENES[scene]
     _assert_image_of_path(name, load(scene, width=WIDTH, height=HEIGHT), max_depth=max_depth)
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_in_variant(variant: str, name: str) -> None:
+def test_image_agrees_with_path_in_variant(variant: str, name: str) -> None:
     _assert_image_of_path(name, load("cornell_box", width=WIDTH, height=HEIGHT), max_depth=6)
 
 
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_under_early_roulette(name: str) -> None:
+def test_image_agrees_with_path_under_early_roulette(name: str) -> None:
     """Long paths through glass: Russian roulette takes the refractive indices into account."""
     scene = load("mirrors_and_glass", width=WIDTH, height=HEIGHT)
     _assert_image_of_path(name, scene, spp=64, max_depth=12, rr_depth=2)
@@ -192,7 +192,7 @@ FILMS = {
 
 @pytest.mark.parametrize("which", FILMS)
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_on_film(name: str, which: str) -> None:
+def test_image_agrees_with_path_on_film(name: str, which: str) -> None:
     image = _assert_image_of_path(name, mi.load_dict(stage(camera=sensor(film=FILMS[which]))))
     if which == "alpha":
         assert 0 < image[..., 3].mean() < 1
@@ -203,7 +203,7 @@ def test_image_is_that_of_path_on_film(name: str, which: str) -> None:
     ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "sobol_owen"],
 )
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_with_sampler(name: str, sampler: str) -> None:
+def test_image_agrees_with_path_with_sampler(name: str, sampler: str) -> None:
     _assert_image_of_path(name, mi.load_dict(stage(camera=sensor(sampler=sampler))))
 
 
@@ -234,7 +234,7 @@ def _sensors() -> dict[str, dict[str, Any]]:
     ["thinlens", "shutter", "orthographic", "radiancemeter", "distant", "irradiancemeter", "batch"],
 )
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_with_sensor(name: str, which: str) -> None:
+def test_image_agrees_with_path_with_sensor(name: str, which: str) -> None:
     scene = stage(**_sensors()[which])
     if which == "irradiancemeter":
         del scene["sensor"]
@@ -243,7 +243,7 @@ def test_image_is_that_of_path_with_sensor(name: str, which: str) -> None:
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_on_spectral_film(variant: str, name: str) -> None:
+def test_image_agrees_with_path_on_spectral_film(variant: str, name: str) -> None:
     band = {"type": "irregular", "wavelengths": "400, 500, 600", "values": "0, 1, 0"}
     camera = sensor(film={"type": "specfilm", "width": 12, "height": 10, "band": band,
                           "rfilter": {"type": "box"}})  # fmt: skip
@@ -253,7 +253,7 @@ def test_image_is_that_of_path_on_spectral_film(variant: str, name: str) -> None
 
 @pytest.mark.parametrize("light", [{"type": "constant"}, None], ids=["environment", "lamp"])
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_with_hidden_emitters(name: str, light: Any) -> None:
+def test_image_agrees_with_path_with_hidden_emitters(name: str, light: Any) -> None:
     """Alpha included: it is 0 where the camera sees only a hidden emitter."""
     camera = sensor(film=film(pixel_format="rgba"))
     scene = mi.load_dict(stage(camera=camera, light=light, wall=None))
@@ -284,7 +284,7 @@ _GAMBLERS = [name for name in TECHNIQUES if TECHNIQUES[name].parameters.get("rej
     for name in _GAMBLERS
 ])  # fmt: skip
 def test_roulette_rejects_shadow_rays_where_most_are_blocked(name: str) -> None:
-    """Otherwise the tests of the mean would have no effect."""
+    """If it did not, the tests of the mean would prove nothing."""
     scene = load("door_ajar", width=WIDTH, height=HEIGHT)
     rays = []
     for technique in (TECHNIQUES["composed_path"], TECHNIQUES[name]):
@@ -300,7 +300,7 @@ AOVS = "depth:depth,normal:sh_normal,albedo:albedo"
 
 
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_output_variables_are_those_of_mitsuba(name: str) -> None:
+def test_output_variables_agree_with_mitsuba(name: str) -> None:
     scene = mi.load_dict(stage())
     path = {"type": "path", "max_depth": 4}
     aov = mi.load_dict({"type": "aov", "aovs": AOVS, "image": path})
@@ -326,7 +326,7 @@ def test_aov_shows_the_image_of_the_nested_integrator(name: str) -> None:
 
 @pytest.mark.parametrize("name", _NESTED)
 def test_moment_sees_single_samples(name: str) -> None:
-    """Nothing is learned there, so the image is that of ``path``."""
+    """Nothing is learned there, so the image agrees with ``path``."""
     scene = mi.load_dict(stage())
     images = [
         batches(scene, mi.load_dict({"type": "moment", "image": inner.make(4)}), 16, [5])[0]

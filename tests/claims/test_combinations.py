@@ -1,4 +1,4 @@
-"""Decisions go together: any two of them, in one integrator, are unbiased."""
+"""Decisions can be combined: any two of them, in one integrator, are unbiased."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 ROWS = covering_array(FACTORS)
 
-#: Of the rows, so many are rendered by ``make test``, in each of two tests.
+#: The number of rows that ``make test`` renders, in each of two tests.
 _QUICK = 2
 
 _OPTICS = {
@@ -110,7 +110,7 @@ def test_furnace_has_the_exact_radiance(variant: str, index: int) -> None:
 
 
 def _assert_all_is_used(row: dict[str, str], integrator: mi.Integrator) -> None:
-    """Otherwise the mean would say little."""
+    """Without this check, a correct mean would say little."""
     if row["directions"] != "uniform":
         assert integrator.learners["directions"].guide is not None
     if row["next_event"] in ("visibility", "contribution") and row["connections"] != "none":
@@ -146,7 +146,7 @@ def _expected(variant: str, choice: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("variant, index", _cases(1), indirect=["variant"])
-def test_mean_is_that_of_path(variant: str, index: int) -> None:
+def test_mean_agrees_with_path(variant: str, index: int) -> None:
     row = ROWS[index]
     expected = _expected(variant, row["scene"])
     integrator = _integrator(row, 4)

@@ -1,4 +1,4 @@
-"""Random scenes: a few of those that ``python -m tests.support.fuzz`` tries by the hundred."""
+"""A few of the random scenes that ``python -m tests.support.fuzz`` tries by the hundred."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ SCENES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("variant", "kind", "scenes"), SCENES, indirect=["variant"])
-def test_random_scenes_are_those_of_path(variant: str, kind: str, scenes: tuple[int, ...]) -> None:
-    """And the noise of the comparisons is small enough."""
+def test_random_scenes_agree_with_path(variant: str, kind: str, scenes: tuple[int, ...]) -> None:
+    """The noise of the comparisons is small enough, too."""
     mi.set_log_level(mi.LogLevel.Error)
     found = [verdict for n in scenes for verdict in verdicts(kind, n, _names(n))]
     told = "\n" + "\n".join(map(str, found))

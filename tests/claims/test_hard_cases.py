@@ -36,13 +36,14 @@ _TWO, _SIX = REFERENCE_SEEDS[:2], REFERENCE_SEEDS[:6]
 
 
 def _scene(case: str) -> mi.Scene:
-    """Not kept, because Dr.Jit compiles the methods of all living objects into each kernel. Not
-    optimized, because the sky leaks through rectangles that Mitsuba 3.9.1 merges in ``path``."""
+    """The scene is not kept, because Dr.Jit compiles the methods of all living objects into each
+    kernel. It is not optimized, because the sky leaks through rectangles that Mitsuba 3.9.1 merges
+    in ``path``."""
     return mi.load_dict(HARD_CASES[case].make(), optimize=False)
 
 
 def _true_scene(case: str) -> mi.Scene:
-    """The scene of which ``path`` renders the case rightly."""
+    """The scene in which ``path`` renders the case correctly."""
     hard = HARD_CASES[case]
     return mi.load_dict((hard.truth or hard.make)(), optimize=False)
 
@@ -219,8 +220,8 @@ def test_gradients_are_refused_with_a_hint_at_prb(name: str) -> None:
 
 
 def _mentions(error: BaseException | None, kind: type, *words: str) -> bool:
-    """Does the chain of causes contain an error of this kind with all these words? (Or a message
-    that quotes one, because Mitsuba's C++ code converts errors to text.)"""
+    """Whether the chain of causes contains an error of this kind with all these words. (Or a
+    message that quotes one, because Mitsuba's C++ code converts errors to text.)"""
     while error is not None:
         text = str(error)
         if (isinstance(error, kind) or kind.__name__ in text) and all(w in text for w in words):

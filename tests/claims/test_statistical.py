@@ -1,4 +1,4 @@
-"""The statistics of the tests detect errors, and accept right images."""
+"""The statistics of the tests detect errors and accept correct images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def mean() -> np.ndarray:
 
 
 def test_equal_means_agree(mean: np.ndarray) -> None:
-    """No z score is larger than those of so many normal numbers."""
+    """No z score is larger than expected of this number of normal variables."""
     for seed in range(60):
         result = compare_pixels(_images(seed, mean), _images(1000 + seed, mean))
         assert np.abs(result.regions).max() < 4.6 and np.abs(result.tiles).max() < 4.6
@@ -41,7 +41,7 @@ def test_equal_means_agree(mean: np.ndarray) -> None:
     ids=["everywhere", "a block", "a small block", "scattered", "half", "a channel"],
 )
 def test_bias_is_found_wherever_it_is(mean: np.ndarray, pixels: tuple, factor: float) -> None:
-    """Also errors of a few pixels, which are not taken for noise."""
+    """Errors of a few pixels are found too: they are not taken for noise."""
     wrong = mean.copy()
     wrong[pixels] *= factor
     with pytest.raises(AssertionError, match="z up to"):

@@ -1,4 +1,4 @@
-"""Renders of several threads: the images are those of renders alone, and a failure stays in its
+"""Renders in several threads: each image agrees with a render alone, and a failure stays in its
 thread."""
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def _check(shared: str, rounds: int, *names: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]
 
 
-def test_images_of_two_threads_are_those_of_renders_alone() -> None:
+def test_images_of_two_threads_agree_with_renders_alone() -> None:
     _check("nothing", 2, "composed_path", "bdpt")
 
 
-def test_images_of_two_threads_with_one_integrator_are_those_of_renders_alone() -> None:
+def test_images_of_two_threads_with_one_integrator_agree_with_renders_alone() -> None:
     _check("integrator", 2, "composed_path")
 
 
@@ -41,7 +41,7 @@ def test_images_of_two_threads_with_one_integrator_are_those_of_renders_alone() 
 @pytest.mark.parametrize(
     "name", ["composed_path", "auto_path", "bdpt", "vcm", "sppm", "mlt", "pssmlt", "neepp", "auto"]
 )
-def test_images_of_many_rounds_in_two_threads_are_those_of_renders_alone(
+def test_images_of_many_rounds_in_two_threads_agree_with_renders_alone(
     shared: str, name: str
 ) -> None:
     _check(shared, 6, name)
@@ -60,7 +60,7 @@ def _render_in_thread(integrator: mi.Integrator, scene: mi.Scene, results: list)
     assert not thread.is_alive(), "the render hangs"
 
 
-def test_a_failed_render_does_not_break_those_of_other_threads() -> None:
+def test_a_failed_render_does_not_break_renders_of_other_threads() -> None:
     scene = mi.load_dict(stage())
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
     results: list = []
@@ -77,7 +77,7 @@ def test_a_failed_render_does_not_break_those_of_other_threads() -> None:
     np.testing.assert_allclose(results[2], results[0], rtol=1e-3, atol=1e-4)
 
 
-def test_renders_of_several_threads_alternate_and_those_with_one_integrator_do_not() -> None:
+def test_renders_of_several_threads_alternate_unless_they_share_an_integrator() -> None:
     """Each render waits in its first pass for the other one to begin, if it may."""
     scene = mi.load_dict(stage())
     for are_same in (False, True):
@@ -124,7 +124,7 @@ def test_a_render_that_waits_for_its_turn_can_be_cancelled() -> None:
 
 
 @pytest.mark.parametrize("name", ["composed_path", "variance"])
-def test_progress_may_render_with_what_another_thread_uses_and_wait_for_it(name: str) -> None:
+def test_progress_may_wait_for_a_thread_that_renders_with_another_integrator(name: str) -> None:
     """The other thread has the second integrator already, and waits for its turn."""
     scene = mi.load_dict(stage())
     two, path = mi.load_dict({"type": "composed_path", "max_depth": 2}), {"type": "path"}

@@ -28,7 +28,7 @@ def assert_image_of_path(
     both: dict[str, Any] | None = None,
     **parameters: Any,
 ) -> None:
-    """The means of the image and of its quarters are those of ``path``."""
+    """The means of the image and of its quarters agree with ``path``."""
     if isinstance(scene, dict):
         scene = mi.load_dict(scene, optimize=False)
     other = mi.load_dict({"type": reference, "max_depth": max_depth, **(both or {})})

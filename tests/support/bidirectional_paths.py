@@ -52,7 +52,7 @@ class Paths:
         emitted: The ray that leaves the light.
         vertices: From light to camera.
         camera_ray: The ray of the camera.
-        active: Which lanes have a path.
+        active: The lanes that have a path.
     """
 
     emitted: EmittedRay

@@ -46,13 +46,13 @@ def found_at(x: mi.Float, y: mi.Float, target: mi.Float) -> tuple[Contribution, 
 
 
 def ramp(numbers: Any) -> tuple[Contribution, Sample]:
-    """Of one number; black below 1/4, where chains must not stay."""
+    """A target of one number. It is black below 1/4, where chains must not stay."""
     x = numbers.next_1d()
     return found_at(x, mi.Float(0.1), dr.maximum(x - 0.25, 0) ** 2)
 
 
 def _hill(numbers: Any) -> tuple[Contribution, Sample]:
-    """Of two numbers, on a plain; a high plateau besides."""
+    """A target of two numbers: a hill on a plain, beside a high plateau."""
     x, y = numbers.next_2d()
     plateau = dr.select((x > 0.625) & (y > 0.75), 2, 0)
     return found_at(x, y, 0.05 + 3 * dr.exp(-60 * ((x - 0.2) ** 2 + (y - 0.3) ** 2)) + plateau)
@@ -60,8 +60,9 @@ def _hill(numbers: Any) -> tuple[Contribution, Sample]:
 
 @dr.syntax
 def _varying(numbers: Any) -> tuple[Contribution, Sample]:
-    """Of a first number which says how many others there are: none, two, or up to six, by what
-    these are. Where there are others, its mean over all but the first two is 2 x y."""
+    """A target whose first number says how many others there are: none, two, or up to six, which
+    depends on their values. If there are others, the mean over all except the first two is 2 x
+    y."""
     x = numbers.next_1d()
     y, target = mi.Float(0.1), mi.Float(0.7)
     if x > 0.5:

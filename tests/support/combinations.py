@@ -1,4 +1,4 @@
-"""Combinations of decisions: few of them, in which any two choices occur together."""
+"""Combinations of decisions: a few of them, in which any two choices occur together."""
 
 from __future__ import annotations
 

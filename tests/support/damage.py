@@ -1,4 +1,4 @@
-"""Damages files: bytes as disks and transfers do, and values as somebody does who means harm."""
+"""Damages files: bytes change as on bad disks, and values as if somebody meant harm."""
 
 from __future__ import annotations
 

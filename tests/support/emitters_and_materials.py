@@ -1,4 +1,4 @@
-"""The stage with every kind of emitter and of material, for integrators that follow light."""
+"""The stage with every kind of emitter and material, for integrators with light paths."""
 
 from __future__ import annotations
 

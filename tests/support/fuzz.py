@@ -159,7 +159,7 @@ class Trial:
     # ---- Images: [seed, height, width, channel] ----
 
     def _path(self, times: int) -> np.ndarray:
-        """So many times the usual number of images of ``path``."""
+        """``times`` the usual number of images of ``path``."""
         if times not in self._reference:
             try:
                 self._reference[times] = self.images_of_path(times)

@@ -1,4 +1,5 @@
-"""Lights of every shape, and what their cells sample and rays find: for tests of the cells."""
+"""Lights of every shape, samples of their cells, and rays that find them, for tests of the
+cells."""
 
 from __future__ import annotations
 
@@ -163,13 +164,14 @@ class Samples:
     """Choices by random probabilities, and rays in all directions towards the light.
 
     Attributes:
-        share: Of the light's cells. (The cells would keep the scene in all later kernels.)
-        probability: Of each cell; some are zero if there are several.
+        share: The share of the light's cells. (The cells would keep the scene in all later
+            kernels.)
+        probability: The probability of each cell; some are zero if there are several.
         cell, pdf, value, d: What was chosen, the density without that choice's probability, the
             unoccluded radiance / pdf, the direction.
-        visible: Does the point emit towards the origin, with nothing in between?
+        visible: True if the point emits towards the origin, with nothing in between.
         cosine: Between that direction and the light.
-        found_cell, found_pdf: What a ray towards the point finds.
+        found_cell, found_pdf: The cell and the density that a ray towards the point finds.
         ray_cell, ray_pdf, ray_value, ray_d: What rays in other directions find; those that do not
             meet the light have the density 0.
         ray_angle: The solid angle from which these are drawn.
@@ -207,10 +209,10 @@ _GROUPS = (
     ("smooth", "smooth patch"),
 )
 
-#: Those that are also looked at in small, large and distant scenes.
+#: Lights that are also tested in small, large and distant scenes.
 SCALED = ("slanted", "disk", "cylinder", "two triangles", "smooth")
 
-#: From the place of one light of a group to that of the next.
+#: From one light of a group to the next one.
 _STEP = np.array([-12.0, 0.0, 0.0])
 
 

@@ -97,7 +97,7 @@ def camera(begin: float = 0.0, end: float = 1.0, plugin: str = "perspective", **
 
 
 def sky() -> Scene:
-    """Not uniform: where nothing is noisy, rounding errors of long sums stand out."""
+    """A sky that is not uniform: without noise, rounding errors of long sums would stand out."""
     pixels = np.random.default_rng(4).uniform(0.2, 0.6, size=(8, 16, 3))
     return {"type": "envmap", "bitmap": bitmap(pixels)}
 

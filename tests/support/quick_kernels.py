@@ -35,7 +35,7 @@ def _compile_quickly() -> None:
 
 
 def _can_be_silent(path: str) -> bool:
-    """Does the library have both options? LLVM 19 prints a line for each pass."""
+    """Whether the library has both options. LLVM 19 prints a line for each pass."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         return data.find(_OPTIONS[-1].strip(b"-").partition(b"=")[0]) >= 0
 

@@ -30,7 +30,7 @@ class Kind:
             scene to test; else the one that ``path`` renders for this time (0 to 1) of the shutter
             interval.
         strata: Number of parts of the shutter interval; ``path`` renders each at a random time, so
-            that the mean of its images is that of the interval.
+            that the mean of its images is the mean over the interval.
         depth: Parameters of integrators that this kind prescribes.
         allowance: Accepted relative difference of the means.
         reference: Mitsuba's integrator, where it is not ``path``.

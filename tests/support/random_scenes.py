@@ -26,7 +26,7 @@ class Maker:
 
     Parameters:
         seed: Selects the scene.
-        folder: Where files of curves are written.
+        folder: The folder for files of curves.
         stream: Selects another sequence of random numbers for the same seed.
     """
 
@@ -341,7 +341,8 @@ class NestedMaker(Maker):
         return self.blend(self.rough)
 
     def bsdf(self) -> Scene:
-        """Not a blend of both kinds: from behind, Mitsuba samples it with a wrong density."""
+        """A rough or a transparent BSDF. It is no blend of both: Mitsuba samples a blend with a
+        wrong density from behind."""
         return self.nested(self.choice(self.rough, self.rough, self.transparent))
 
     def nested(self, inner: Callable[[], Scene]) -> Scene:

@@ -43,7 +43,7 @@ THRESHOLD = 4.0
 SEEDS = range(1, 17)
 REFERENCE_SEEDS = range(1001, 1017)
 
-#: So many seeds where a light path brings light to many pixels: their errors depend on each other.
+#: Number of seeds if a light path brings light to many pixels, whose errors depend on each other.
 MANY_SEEDS = 8
 
 #: Relative rounding error that a mean of many floats may have.
@@ -275,8 +275,8 @@ def compare_pixels(a: np.ndarray, b: np.ndarray, tile: int = 8, unit: int = 1) -
 def z_of_means(
     a: np.ndarray, b: np.ndarray | float, caution: float = 1.0, allowance: float = 0.0
 ) -> tuple[float, float]:
-    """Do the means of ``a`` and ``b`` (or a number) agree? Both have the shape [seed, value]: the
-    values of a seed may have different means, and their errors are independent.
+    """Tests whether the means of ``a`` and ``b`` (or a number) agree. Both have the shape [seed,
+    value]: the values of a seed may have different means, and their errors are independent.
 
     Returns:
         The z score (of the part of the difference that exceeds ``allowance``), and the standard
@@ -300,7 +300,7 @@ def z_of_means(
 
 
 def _cut(height: int, width: int, rows: int, columns: int) -> list[tuple[slice, slice]]:
-    """Tiles of at most so many rows and columns."""
+    """Tiles of at most ``size`` rows and columns."""
     return [
         (slice(y, y + rows), slice(x, x + columns))
         for y in range(0, height, rows)
@@ -328,8 +328,8 @@ def assert_same_pixels_on_average(
     unit: int = 1,
     tolerance: float = 0.0,
 ) -> Comparison:
-    """As :func:`assert_same_mean`, for two images of each, by the scatter in all pixels: see
-    :func:`compare_pixels`."""
+    """Like :func:`assert_same_mean`, for two images of each. The noise is estimated from the
+    scatter in all pixels: see :func:`compare_pixels`."""
     return _assert_agreement(a, b, compare_pixels(a, b, tile, unit), precision, tolerance)
 
 
@@ -355,13 +355,13 @@ def assert_exact(
     precision: float = 0.02,
     independent: bool = True,
 ) -> float:
-    """The mean over ``pixels`` is ``exact``, and where each of them has that value (``uniform``),
-    that of each tile of them too. Returns the relative standard error of the mean.
+    """Asserts that the mean over ``pixels`` is ``exact``, and the mean of each tile too if each
+    pixel has that value (``uniform``). Returns the relative standard error of the mean.
 
     Parameters:
         images: Of two seeds at least, with a box filter: [seed, height, width, channel].
-        independent: Do the errors of pixels not depend on each other? If they do, many seeds are
-            needed.
+        independent: True if the errors of pixels do not depend on each other. If they do, many
+            seeds are needed.
     """
     assert_images_are_sound(images)
     part = images[:, pixels[0], pixels[1]].mean(axis=3)

@@ -10,8 +10,8 @@ CELLS = 6
 
 
 def triangle_solid_angle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Of triangles with these corners, [..., 3], as seen from the origin (Van Oosterom and Strackee
-    1983)."""
+    """The solid angles of triangles with these corners, [..., 3], as seen from the origin (Van
+    Oosterom and Strackee 1983)."""
     la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     volume = np.abs((a * np.cross(b - a, c - a)).sum(-1))
     ab, bc, ac = ((u * v).sum(-1) for u, v in ((a, b), (b, c), (a, c)))
@@ -44,7 +44,7 @@ def disk_cells(x: float, h: float) -> np.ndarray:
     q_2 = (x * np.sin(φ)) ** 2 + h**2
 
     def integral(r: np.ndarray) -> np.ndarray:
-        """Of h r / distance³ over the radius."""
+        """The integral of h r / distance³ over the radius."""
         distance = np.sqrt((r - a) ** 2 + q_2)
         return h * (a * (r - a) / (q_2 * distance) - 1 / distance)
 

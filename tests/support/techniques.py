@@ -1,4 +1,4 @@
-"""The table of techniques, which must have the mean of ``path``, and of the tests that each gets.
+"""The table of techniques, which must have the mean of ``path``, and of the tests of each.
 
 A new technique takes one row, in ``camera_techniques.py`` or ``splat_techniques.py``. ``make test``
 runs the tests in ``checks``; tests that are only in ``thorough`` are marked ``slow``, and

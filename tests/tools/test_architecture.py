@@ -70,7 +70,7 @@ def _files(folder: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
 
 
 @pytest.mark.parametrize("room", [room for room in FLOOR if room not in PLUGINS])
-def test_a_room_imports_nothing_that_stands_above_it(room: str) -> None:
+def test_a_room_imports_from_lower_floors_only(room: str) -> None:
     files = list(_files(PACKAGE / room))
     assert files, "the room is gone"
     upward = [
@@ -93,7 +93,7 @@ def test_few_modules_stand_loose() -> None:
 
 
 def test_no_rooms_import_each_other() -> None:
-    """Nor in a circle of more of them."""
+    """No circle of several rooms exists either."""
     imports: dict[str, set[str]] = {}
     for file, package in _files(PACKAGE):
         room = package[1] if len(package) > 1 else file.stem

@@ -38,7 +38,7 @@ def test_range_of_mitsuba_is_the_same_in_both_places() -> None:
     assert f'"mitsuba>={first},<{end}"' in PYPROJECT
 
 
-def test_version_is_that_of_the_changes_and_of_the_citation() -> None:
+def test_the_changes_and_the_citation_name_the_version() -> None:
     """The version stands in ``mitsuba_ext.__version__``; these two files repeat it."""
     entries = re.findall(
         r"^## \[(.+?)\] – (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
@@ -52,7 +52,7 @@ def test_version_is_that_of_the_changes_and_of_the_citation() -> None:
     assert re.search(attribute, PYPROJECT, re.MULTILINE)
 
 
-def test_authors_and_keywords_are_those_of_the_citation() -> None:
+def test_authors_and_keywords_agree_with_the_citation() -> None:
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     names = re.findall(r"^  - name: (.+)$", citation, re.MULTILINE)
     keywords = re.search(r"^keywords:\n((?:  - .+\n?)+)", citation, re.MULTILINE)[1]
@@ -159,7 +159,7 @@ subprocess.run(python_command("worker", "1 + 1", "'"))
     assert result.stdout == f"""__main__ ['1 + 1', "'"] {plugin}\n""", result.stderr
 
 
-def test_no_process_is_started_with_what_the_current_folder_holds() -> None:
+def test_no_process_imports_files_of_the_current_folder() -> None:
     for file in SOURCES[0].rglob("*.py"):
         assert '"-m"' not in file.read_text(), f"{file}: use python_command"
 
@@ -209,7 +209,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 
 @pytest.mark.slow
-def test_archive_has_what_the_tests_and_the_docs_need(built: tuple[Path, Path, Path]) -> None:
+def test_the_archive_has_the_files_that_tests_and_docs_need(built: tuple[Path, Path, Path]) -> None:
     tree, archive, _ = built
     with tarfile.open(archive) as file:
         names = {name.partition("/")[2] for name in file.getnames()}

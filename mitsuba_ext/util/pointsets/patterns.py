@@ -62,7 +62,7 @@ def points(
         if not isinstance(value, numbers.Integral) or value < 1:
             raise ValueError(f"points: {name} is {value}, not an integer of at least 1")
     rng = np.random.default_rng(seed)
-    x = _MAKERS[pattern](count, dimension, rng)
+    x = MAKERS[pattern](count, dimension, rng)
     # Points stay below 1 even when rounded to single precision
     return np.minimum(x, 1 - 2.0**-24)
 
@@ -177,7 +177,9 @@ def _qmc():
     return qmc
 
 
-_MAKERS = {
+#: By name of a pattern, the function that makes its points from a count, a dimension and an
+#: ``rng``.
+MAKERS = {
     "independent": lambda count, dimension, rng: rng.random((count, dimension)),
     "stratified": _stratified,
     "latin_hypercube": _latin_hypercube,

@@ -1,4 +1,4 @@
-"""The command line: what it writes, and what it says about bad input."""
+"""The command line: its output, and its errors for bad input."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_names_that_are_not_utf8_are_refused(run, make_scene, tmp_path, monkeypa
     assert code == 2 and "b?d" in err and "is not UTF-8" in err and err.count("\n") == 1
 
 
-def test_terminal_that_is_gone_changes_no_exit_code(run, tmp_path, monkeypatch):
+def test_a_closed_terminal_changes_no_exit_code(run, tmp_path, monkeypatch):
     def gone(*_, **__):
         raise OSError(errno.EIO, "Input/output error")
 
@@ -194,8 +194,8 @@ def test_terminal_that_is_gone_changes_no_exit_code(run, tmp_path, monkeypatch):
 # ---- list, pages ----
 
 
-def test_what_only_prints_starts_without_mitsuba(make_scene, tmp_path):
-    """Nor does it need a variant, LLVM, or the packages that are slow to import."""
+def test_commands_that_only_print_start_without_mitsuba(make_scene, tmp_path):
+    """They need no variant, no LLVM, and no packages that are slow to import either."""
     render = ["render", str(make_scene()), "-o", str(tmp_path / "image.exr"), "--integrator"]
     command_lines = [
         ["--help"], ["--version"], ["render", "--help"], ["list"], ["list", "neepp"],
@@ -221,7 +221,7 @@ assert "rich" in sys.modules
     assert '"learned_lights" is not an integrator, but a decision to be nested in' in result.stderr
 
 
-def test_list_says_whose_plugin_a_name_is_or_what_it_may_have_meant(run):
+def test_list_names_the_origin_of_a_plugin_or_similar_names(run):
     for name, message in (
         ("path", '"path" is an integrator of Mitsuba\'s own'),
         ("sphere", '"sphere" is a plugin of Mitsuba\'s own'),

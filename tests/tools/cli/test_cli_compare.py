@@ -1,4 +1,4 @@
-"""The command ``compare``: what it writes, and what it says about bad input."""
+"""The command ``compare``: its output, and its errors for bad input."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_every_budget_works(run, make_scene, tmp_path, budget, kind, levels, wit
         assert found == levels if levels else found[0] == 8
 
 
-def test_the_changes_of_a_scene_are_those_of_all_its_images(
+def test_the_changes_of_a_scene_apply_to_all_its_images(
     run, make_scene, tmp_path, without_report
 ):
     command = ("compare", make_scene(), "path", "prb", "--spp", 2, "--seeds", 1, "--out", tmp_path,
@@ -276,7 +276,7 @@ def stored_runs(folder) -> list[int]:
     return [len(record["runs"]) for record in results["scenes"][0]["integrators"]]
 
 
-def test_interruption_reports_what_is_finished(run, make_scene, tmp_path, monkeypatch):
+def test_interruption_reports_finished_results(run, make_scene, tmp_path, monkeypatch):
     measure = Experiment._measure
 
     def interrupted(self, contender, index, round, path):

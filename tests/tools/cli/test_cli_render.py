@@ -160,7 +160,7 @@ def test_render_fills_a_time(run, make_scene, tmp_path):
 _CHANGES = ["--size", "12x8", "--crop", "5x4+6+3", "--filter", "tent:radius=2", "--max-depth", 1]
 
 
-def test_crop_window_filter_and_depth_replace_those_of_the_scene(run, make_scene, tmp_path):
+def test_crop_window_filter_and_depth_replace_the_settings_of_the_scene(run, make_scene, tmp_path):
     def image(path, *options) -> np.ndarray:
         command = ["render", path, "-o", tmp_path / "a.exr", "--integrator", "path", "--spp", 4]
         assert run(*command, *options)[0] == 0
@@ -220,7 +220,7 @@ def test_a_checkpoint_folder_belongs_to_the_changes_of_its_scene(run, make_scene
 def test_a_render_says_how_much_of_the_time_it_used(
     run, make_scene, tmp_path, integrator, monkeypatch
 ):
-    """Of our integrators, those that learn plan for the time, and others are measured."""
+    """Our integrators that learn plan for the time; the speed of the others is measured."""
     monkeypatch.setattr(timing, "samples_for", lambda *_: 2)
     command = ["render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator]
     _, out, err = run(*command, "--time", 0.5 if integrator != "composed_path" else 60)
@@ -250,7 +250,7 @@ def test_pixels_that_are_not_finite_are_counted(run, make_scene, tmp_path):
     assert f"48 of 48 pixels of {tmp_path / 'a.exr'} are NaN or infinite" in err
 
 
-def test_what_the_image_does_not_show_is_said(run, make_scene, tmp_path):
+def test_warnings_name_the_parts_of_a_scene_that_the_image_lacks(run, make_scene, tmp_path):
     """Media, which path does not see; no light; other sensors than the first."""
     second = '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="5"/>'
     fog = '<medium type="homogeneous" name="interior"/><bsdf type="null"/>'

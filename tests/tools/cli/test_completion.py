@@ -1,4 +1,4 @@
-"""Completion in shells: what is offered, and what bash, zsh and fish make of it."""
+"""Completion in shells: the offered words, and their use by bash, zsh and fish."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def offered(monkeypatch, capsys):
     return ask
 
 
-def test_what_is_offered(offered, tmp_path, monkeypatch):
+def test_completion_offers_options_plugins_and_files(offered, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("box.xml", "box.png", "animate.py", ".hidden.xml"):
         Path(name).touch()

@@ -134,7 +134,7 @@ def _diffuse(*rgb):
 
 
 @pytest.mark.parametrize("film", [{}, {"width": 1, "height": 1}, {"rfilter": {"type": "gaussian"}}])
-def test_guides_are_those_of_what_a_mirror_shows(film):
+def test_guides_show_the_objects_in_a_mirror(film):
     mirror = {"type": "conductor", "material": "none",
               "specular_reflectance": {"type": "rgb", "value": [0.5, 1, 1]}}  # fmt: skip
     # The mirror shows a wall behind the camera
@@ -143,7 +143,7 @@ def test_guides_are_those_of_what_a_mirror_shows(film):
     np.testing.assert_allclose(found[..., 3:].mean((0, 1)), [0, 0, 1], atol=1e-5)
 
 
-def test_guides_are_those_of_what_is_behind_glass_and_holes():
+def test_guides_show_the_objects_behind_glass_and_holes():
     pane = {"type": "thindielectric", "int_ior": 1.0001}
     hole = {"type": "mask", "opacity": 0.25, "b": _diffuse(0, 0, 0)}
     wall = _wall(6, _diffuse(0.8, 0.8, 0.8))
@@ -170,7 +170,7 @@ def test_guides_have_colours_in_spectral_variants_too(variant):
         assert found.min() > 0.1
 
 
-def test_two_mirrors_end():
+def test_paths_between_two_mirrors_end():
     mirror = {"type": "conductor", "material": "none"}
     found = _guides(_wall(4, mirror), _wall(-3, mirror, 0))
     assert np.isfinite(found).all()

@@ -1,4 +1,4 @@
-"""The exit codes of each subcommand: those of the table in docs/command.md."""
+"""The exit codes of each subcommand agree with the table in docs/command.md."""
 
 from __future__ import annotations
 

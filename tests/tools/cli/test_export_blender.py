@@ -27,7 +27,7 @@ PREFIX = "Stokes" * 3
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_entry_has_what_the_menus_are_made_from(name: str) -> None:
+def test_an_entry_has_the_data_of_the_menus(name: str) -> None:
     entry = TABLE[name]
     assert set(entry) == {"label", "description", "parameters"}
     assert entry["label"] and entry["description"] and f"({name})" not in entry["label"]

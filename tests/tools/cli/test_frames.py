@@ -131,7 +131,7 @@ def test_frames_are_kept_each_in_a_folder(
 
 
 @pytest.mark.slow
-def test_frames_go_on_after_the_process_was_killed(make_scene, tmp_path):
+def test_frames_continue_after_the_process_was_killed(make_scene, tmp_path):
     (tmp_path / "animate.py").write_text(FUNCTION)
     scene = make_scene(body=BODY.replace("<shape", '<shape id="ball"'))
     command = [sys.executable, "-m", "mitsuba_ext", *map(str, (
@@ -176,7 +176,7 @@ def wrong(frame):
 
 
 @pytest.mark.parametrize("options", [(), ("--until", "1e-9")])
-def test_a_function_moves_things_without_another_load(run, make_scene, tmp_path, options):
+def test_a_function_moves_objects_without_loading_anew(run, make_scene, tmp_path, options):
     body = BODY.replace("<shape", '<shape id="ball"').replace(
         "/></shape>", '><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>')
     scene = make_scene(body=body)

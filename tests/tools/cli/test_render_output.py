@@ -50,7 +50,7 @@ def test_a_file_that_another_render_writes_is_refused(run, make_scene, tmp_path)
 def test_a_read_only_target_is_found_before_the_render(
     run, make_scene, tmp_path, monkeypatch, which
 ):
-    """Not by its mode, as the user that runs the tests may write all files."""
+    """The test does not change modes, because its user may be allowed to write all files."""
     (tmp_path / which).touch()
 
     def access(path, mode, *, _access=os.access, **named) -> bool:

@@ -36,7 +36,7 @@ def interrupted_integrator():
     return "interrupted"
 
 
-def test_interrupted_render_writes_what_the_film_holds(
+def test_an_interrupted_render_writes_the_content_of_the_film(
     run, make_scene, tmp_path, interrupted_integrator
 ):
     output = tmp_path / "image.exr"
@@ -107,10 +107,10 @@ def test_a_signal_ends_the_render_after_a_pass_and_keeps_an_older_image(
 
 
 @pytest.mark.parametrize("names", [("SIGHUP", "SIGTERM", "SIGINT"), ("SIGINT", "SIGINT")])
-def test_signals_that_come_together_count_as_one(
+def test_signals_at_the_same_time_count_as_one(
     run, make_scene, tmp_path, third_pass_gets, names
 ):
-    """As from a closed terminal, to which printing messages fails too."""
+    """They come from a closed terminal, for example, where printing fails too."""
     output, integrator = tmp_path / "a.exr", third_pass_gets(*names)
     code, _, err = run(
         "render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40
@@ -119,7 +119,7 @@ def test_signals_that_come_together_count_as_one(
     assert read_exr(output)[1]["spp"] == 12
 
 
-def test_second_signal_that_python_hears_of_late_does_nothing():
+def test_a_second_signal_that_python_handles_late_does_nothing():
     """Handlers run after native code, so the time between two calls of a handler is not the time
     between two signals."""
     stop = Stop()
@@ -164,7 +164,7 @@ def test_signals_do_not_interrupt_the_writing_of_the_image(
     assert read_exr(output)[1]["spp"] == 12
 
 
-def test_signals_that_are_ignored_stay_so():
+def test_ignored_signals_stay_ignored():
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with interrupts.deferred_interrupt():
@@ -178,7 +178,7 @@ def test_signals_that_are_ignored_stay_so():
         signal.signal(signal.SIGINT, previous)
 
 
-def test_a_second_signal_ends_the_process_whatever_runs(run, make_scene, tmp_path, monkeypatch):
+def test_a_second_signal_always_ends_the_process(run, make_scene, tmp_path, monkeypatch):
     mi.set_variant("llvm_ad_rgb")
     prb = type(mi.load_dict({"type": "prb"}))
     exits: list[int] = []

@@ -20,7 +20,7 @@ def every_event(monkeypatch):
     monkeypatch.setattr(reports, "_PERIOD", 0.0)
 
 
-def test_a_quiet_render_says_nothing_but_warnings(run, make_scene, tmp_path):
+def test_a_quiet_render_prints_warnings_only(run, make_scene, tmp_path):
     command = ("render", make_scene(), "--quiet", "-o")
     assert run(*command, tmp_path / "a.exr") == (0, "", "")
     assert run(*command, tmp_path / "a.exr", "--until", "1") == (0, "", "")
@@ -50,7 +50,7 @@ def test_a_script_reads_events(run, make_scene, tmp_path, every_event, options):
 
 
 @pytest.mark.usefixtures("batches_of_sixteen_samples")
-def test_the_error_is_told_without_being_asked_for(run, make_scene, tmp_path, every_event):
+def test_the_error_is_shown_by_default(run, make_scene, tmp_path, every_event):
     out = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 160, "--json",
               "--checkpoint", tmp_path / "kept")[1]  # fmt: skip
     *steps, _ = (json.loads(line) for line in out.splitlines())
@@ -58,7 +58,7 @@ def test_the_error_is_told_without_being_asked_for(run, make_scene, tmp_path, ev
     assert "relmse" not in steps[6] and 0 < steps[9]["relmse"] < 1
 
 
-def test_nothing_else_gets_among_the_events(run, make_scene, tmp_path):
+def test_the_output_contains_only_events(run, make_scene, tmp_path):
     """Mitsuba prints its warnings to stdout, and so may a module of the user."""
     module = tmp_path / "loud.py"
     module.write_text(
@@ -77,7 +77,7 @@ def test_nothing_else_gets_among_the_events(run, make_scene, tmp_path):
 @pytest.mark.parametrize(("integrator", "options"), [
     ("path", ()), ("neepp:grid=4", ()), ("neepp:grid=4", ("--until", "1e-9")),
 ])  # fmt: skip
-def test_the_end_says_what_the_render_cost(run, make_scene, tmp_path, integrator, options):
+def test_a_render_shows_and_keeps_its_cost(run, make_scene, tmp_path, integrator, options):
     target = tmp_path / "a.exr"
     command = ("render", make_scene(), "-o", target, "--integrator", integrator, "--spp", 256,
                "--seed", 5, *options)  # fmt: skip
@@ -114,7 +114,7 @@ def test_costs_add_up():
     assert many == ["  path, seeds 0, 1, 2, 3, …, v, mitsuba_ext 1, Mitsuba 3"]
 
 
-def test_threads_are_those_of_all_processes(run, make_scene, tmp_path):
+def test_threads_are_counted_over_all_processes(run, make_scene, tmp_path):
     before = dr.thread_count()
     try:
         assert run("render", make_scene(), "-o", tmp_path / "a.exr", "--threads", 3)[0] == 0

@@ -1,4 +1,4 @@
-"""Misspelt names, wherever a user writes them, are answered with the name that was meant."""
+"""Errors for misspelt names suggest the intended name, wherever a user writes them."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_errors_in_traced_code_keep_their_sentence() -> None:
     assert one_line(caught.value) == "the light needs a shape"
 
 
-def test_a_nested_decision_without_a_name_is_told_its_slot(run, tmp_path: Path) -> None:
+def test_the_error_for_a_nested_decision_without_a_name_names_its_slot(run, tmp_path: Path) -> None:
     err = _complaint(
         run, tmp_path, integrator="composed_path", inside='<sampler type="mis_heuristic"/>'
     )

@@ -54,7 +54,7 @@ def supervise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("code", [0, 1, 2, 130])
-def test_worker_that_ends_in_order_ends_all(supervise, tmp_path, capfd, code):
+def test_a_worker_that_ends_in_order_ends_everything(supervise, tmp_path, capfd, code):
     # The mark of another process: no integrator is blamed
     lines = f"mark.parent.mkdir(); mark.write_text('1'); sys.exit({code})"
     assert supervise(lines) == (code, ["measure"])
@@ -82,7 +82,7 @@ def test_render_that_takes_too_long_is_ended_and_followed_by_others(supervise, t
     assert crashed.read_text() == "a render took more than the 0.2 s of --limit"
 
 
-def test_limit_is_of_each_render_and_not_of_references(supervise):
+def test_the_limit_applies_to_each_render_but_not_to_references(supervise):
     lines = """
 begin()
 for _ in range(8):
@@ -96,13 +96,13 @@ os.remove(folder / "references" / "b.running")
     assert supervise(lines, limit=0.5)[1] == ["measure"]
 
 
-def test_worker_that_dies_again_and_again_is_given_up(supervise, capfd):
+def test_a_worker_that_dies_again_and_again_is_abandoned(supervise, capfd):
     assert supervise("begin(); os._exit(3)") == (1, ["measure", "measure"])
     assert "exit code 3 in the same render again: given up" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("end, code", [("os.abort()", 1), ("os._exit(3)", 3)])
-def test_worker_that_dies_outside_of_a_render_ends_all_with_a_word(supervise, capfd, end, code):
+def test_a_worker_that_dies_outside_of_renders_ends_all_with_a_message(supervise, capfd, end, code):
     assert supervise(end) == (code, ["measure"])
     assert capfd.readouterr().err.startswith("mitsuba-ext: the process ")
 
@@ -114,14 +114,14 @@ def test_signals_interrupt_the_worker_which_reports(supervise, number):
     assert signal.getsignal(number) == before
 
 
-def test_render_that_does_not_hear_is_given_up_after_sigterm(supervise, capfd, monkeypatch):
+def test_a_render_that_ignores_signals_is_abandoned_after_sigterm(supervise, capfd, monkeypatch):
     monkeypatch.setattr(supervisor, "GRACE", 0.1)
     lines = "if job == 'stored': sys.exit(130)\nbegin(); wait(signal.SIGINT, signal.SIG_IGN)"
     assert supervise(lines) == (143, ["measure", "stored"])
     assert "the running render is given up" in capfd.readouterr().err
 
 
-def test_report_is_waited_for_after_sigterm(supervise, monkeypatch):
+def test_after_sigterm_the_supervisor_waits_for_the_report(supervise, monkeypatch):
     monkeypatch.setattr(supervisor, "GRACE", 0.05)
     lines = "wait(signal.SIGINT, lambda *_: (time.sleep(0.3), log('written'), os._exit(130)))"
     assert supervise(lines) == (143, ["measure", "written"])
@@ -138,7 +138,7 @@ wait(signal.SIGINT, lambda *_: (time.sleep(0.3), log('written'), os._exit(130)))
     assert jobs == ["measure", "written"]
 
 
-def test_worker_hears_its_supervisor_where_ctrl_c_is_ignored(supervise):
+def test_the_worker_obeys_its_supervisor_where_ctrl_c_is_ignored(supervise):
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         lines = "sys.exit(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
@@ -150,7 +150,7 @@ def test_worker_hears_its_supervisor_where_ctrl_c_is_ignored(supervise):
         signal.signal(signal.SIGINT, previous)
 
 
-def test_second_interrupt_gives_up_the_running_render(supervise, capfd, monkeypatch):
+def test_a_second_interrupt_abandons_the_running_render(supervise, capfd, monkeypatch):
     monkeypatch.setattr(interrupts, "TOGETHER", 0.0)
     lines = """
 if job == 'stored': sys.exit(130)
@@ -162,7 +162,7 @@ wait(signal.SIGINT, lambda *_: os.kill(parent, signal.SIGINT))
     assert "waiting for the running render" in err and "is given up" in err
 
 
-def test_worker_is_interrupted_once_and_not_by_what_nohup_ignores():
+def test_the_worker_is_interrupted_once_and_not_by_signals_that_nohup_ignores():
     lines = """
 import os, signal, time
 from mitsuba_ext.cli import supervisor
@@ -238,7 +238,7 @@ def test_marks_of_a_process_that_is_gone_are_removed(tmp_path):
     assert not list((tmp_path / "scene").iterdir())
 
 
-def test_folder_that_was_made_for_nothing_goes_again(tmp_path):
+def test_a_folder_that_stayed_empty_is_removed(tmp_path):
     with marks.in_use(tmp_path / "a" / "b"):
         assert (tmp_path / "a" / "b").is_dir()
     assert not (tmp_path / "a").exists()

@@ -20,8 +20,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.mark.usefixtures("without_report")
 def test_noise_that_all_pixels_share_widens_the_interval(clock, tmp_path) -> None:
-    """As that of the brightness of a chain's image: with seeds as the samples, the error is known
-    to a factor of some; with the 768 pixels as the samples, it would seem known to 15 %."""
+    """The brightness of a chain's image has such noise. With seeds as the samples, the error is
+    known to a factor of a few; with the 768 pixels as the samples, it would seem to be known to 15
+    %."""
     integrators = {
         "alone": noisy_integrator(clock), "shared": noisy_integrator(clock, is_shared=True)
     }
@@ -43,7 +44,7 @@ _CHAINS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _CHAINS)
-def test_the_variance_of_chains_is_that_between_seeds(name: str) -> None:
+def test_the_variance_of_chains_is_the_variance_between_seeds(name: str) -> None:
     """What is told equals what many renders show. As many independent samples would have a fraction
     of it, and a chain's own samples, taken for such, would say so."""
     common = {"max_depth": 3, "direct_samples": -1, "luminance_samples": 4096}

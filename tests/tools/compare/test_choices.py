@@ -18,8 +18,8 @@ _SHAPE = (40, 60, 3)
 
 
 def _images(rng: np.random.Generator, noise: float, sparks: int = 0) -> list[np.ndarray]:
-    """Three renders of a scene whose radiance is 1 everywhere, with so many pixels that are far too
-    bright."""
+    """Three renders of a scene whose radiance is 1 everywhere, with ``sparks`` pixels that are far
+    too bright."""
     images = [rng.normal(1.0, noise, _SHAPE) for _ in range(3)]
     for image in images:
         image.reshape(-1, 3)[rng.choice(40 * 60, sparks, replace=False)] += 30.0
@@ -33,7 +33,7 @@ def test_errors_are_the_relative_variance_of_one_render() -> None:
     assert found["auto"].mean() == pytest.approx(0.01 / 1.01, rel=0.1)
 
 
-def test_sparks_count_alike_whoever_has_them() -> None:
+def test_sparks_count_the_same_in_each_integrator() -> None:
     rng = np.random.default_rng(2)
     found = errors({"path": _images(rng, 0.1, 24), "auto": _images(rng, 0.1, 24)})
     assert found["auto"].mean() == pytest.approx(found["path"].mean(), rel=0.1)

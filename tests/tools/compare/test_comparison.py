@@ -1,4 +1,4 @@
-"""Comparisons: figures that are known beforehand."""
+"""Comparisons reproduce figures that are known beforehand."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_until_stops_at_the_error_and_says_what_it_costs(clock, tmp_path):
 
 
 @pytest.mark.slow
-def test_until_ends_where_a_biased_integrator_never_arrives(clock, tmp_path):
+def test_until_ends_for_a_biased_integrator_that_never_reaches_the_error(clock, tmp_path):
     biased = {"first": noisy_integrator(clock), "biased": noisy_integrator(clock, mean=1.5)}
     scene = compare_noisy(compare.until(0.02), biased, tmp_path, reference_spp=128)
     first, biased = scene["integrators"]

@@ -53,7 +53,7 @@ def test_reference_that_is_longer_than_needed_is_taken(clock, tmp_path):
     assert compare.render_reference(scene, 200, tmp_path, enough=100).spp == 128
 
 
-def test_interrupted_reference_goes_on_where_it_was(tmp_path):
+def test_an_interrupted_reference_continues_where_it_was(tmp_path):
     ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0, 0, 5])}
     sphere = compare.load_scene({**WHITE, "ball": ball}, keep_integrator=False)
     whole = compare.render_reference(sphere, 32, tmp_path)
@@ -174,7 +174,7 @@ def test_scene_that_fails_is_an_entry_and_does_not_stop_the_others(clock, tmp_pa
         compare.Comparison(broken, ["path"], compare.equal_samples(4)).run()
 
 
-def test_second_comparison_takes_up_what_is_there(clock, tmp_path):
+def test_a_second_comparison_continues_the_first(clock, tmp_path):
     calls = []
     integrators = {"noisy": noisy_integrator(clock, calls=calls)}
 
@@ -292,7 +292,7 @@ def test_times_without_a_common_session_give_no_ratio(clock, tmp_path, monkeypat
     assert len(scene["integrators"][1]["runs"]) == 2
 
 
-def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkeypatch):
+def test_interruption_keeps_finished_results_and_says_so(clock, tmp_path, monkeypatch):
     integrators = {"noisy": noisy_integrator(clock)}
     comparison = compare.Comparison(
         WHITE, integrators, compare.equal_samples(8), folder=tmp_path, reference_spp=16
@@ -368,7 +368,7 @@ def test_bad_input_is_refused_at_once(scenes, integrators, options, message):
         compare.Comparison(scenes, integrators, compare.equal_samples(4), **options)
 
 
-def test_budget_that_is_none_is_refused():
+def test_a_text_that_is_no_budget_is_refused():
     for budget in (64, None, [4, 16], "64"):
         with pytest.raises(InputError, match=r"made by equal_samples\(64\), .* or until\(0.01\)"):
             compare.Comparison(WHITE, ["path"], budget)
@@ -386,6 +386,6 @@ def test_budget_that_is_none_is_refused():
         (compare.until, -1),
     ],
 )
-def test_budgets_refuse_what_makes_no_sense(make, value):
+def test_budgets_without_sense_are_refused(make, value):
     with pytest.raises(InputError):
         make(value)

@@ -55,7 +55,7 @@ def test_no_damaged_reference_or_run_is_taken_for_another(tmp_path):
     assert refused > 200  # of 300
 
 
-def test_what_is_damaged_in_a_folder_is_made_anew_and_named(clock, tmp_path):
+def test_damaged_files_of_a_folder_are_named_and_made_anew(clock, tmp_path):
     integrator = {"noisy": noisy_integrator(clock)}
 
     def compared() -> tuple[dict, list[str]]:
@@ -115,7 +115,7 @@ def test_damaged_times_of_other_sessions_are_not_used(tmp_path):
 
 
 @pytest.mark.parametrize("where", [b"Mitsuba version", b"channels"])
-def test_a_damaged_header_of_a_users_image_is_a_sentence(where, run, make_scene, tmp_path):
+def test_a_damaged_header_of_a_users_image_is_named_in_a_sentence(where, run, make_scene, tmp_path):
     path = tmp_path / "image.exr"
     compare.write_exr(path, np.ones((6, 8, 3)), "RGB", {"about": "image"})
     data = path.read_bytes()
@@ -133,7 +133,7 @@ def test_a_damaged_header_of_a_users_image_is_a_sentence(where, run, make_scene,
         assert err.count("\n") <= 1
 
 
-def test_diff_tells_that_an_image_is_not_as_it_was_written(run, tmp_path):
+def test_diff_says_that_an_image_was_changed_after_it_was_written(run, tmp_path):
     path = tmp_path / "image.exr"
     pixels = np.random.default_rng(1).random((6, 8, 3))
     compare.write_exr(path, pixels, "RGB", {"spp": 4})

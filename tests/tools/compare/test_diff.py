@@ -60,7 +60,7 @@ def exr(tmp_path):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_exr_is_read_as_it_is_and_tells_about_itself(tmp_path, half):
+def test_an_exr_is_read_unchanged_with_its_metadata(tmp_path, half):
     path = tmp_path / "image.exr"
     pixels = random_image() - 0.5
     if half:
@@ -209,7 +209,7 @@ def test_npz_of_mean_and_variance(tmp_path):
 # ---- the command ----
 
 
-def test_diff_reports_what_the_metrics_say(run, exr):
+def test_diff_reports_the_metrics(run, exr):
     image, reference = random_image(), random_image(4)[:, :, :3]
     code, out, err = run("--json", exr("a.exr", image), exr("b.exr", reference))
     assert (code, err) == (0, "")

@@ -1,4 +1,5 @@
-"""Confidence intervals: their formulas, and how often they contain the right value."""
+"""Confidence intervals follow their formulas, and contain the true value as often as they
+promise."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ def test_equal_values_have_no_spread():
     assert intervals.mean([0.0, 0.0]) == Estimate(0.0, 0.0, 0.0)
 
 
-def test_one_value_has_no_interval_and_none_no_estimate():
+def test_one_value_has_no_interval_and_an_empty_list_has_no_estimate():
     assert intervals.mean([2.0]) == Estimate(2.0)
     assert intervals.mean([]) is None
     assert intervals.mean([1.0, math.nan]) is None
@@ -43,7 +44,7 @@ def test_median_is_not_moved_by_one_slow_run():
     assert intervals.median([1.0, 1.1, 9.0]).value == 1.1
 
 
-def test_what_paired_runs_share_cancels_in_their_ratio():
+def test_noise_that_paired_runs_share_cancels_in_their_ratio():
     mood = [1.0, 2.0, 5.0]
     a, b = [2 * m for m in mood], mood
     ratio = intervals.ratio(intervals.mean(a), intervals.mean(b), zip(a, b))

@@ -1,4 +1,4 @@
-"""What notebooks show of statistics and comparisons: short tables, in which all text is escaped."""
+"""Notebooks show statistics and comparisons as short tables, in which all text is escaped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which integrator renders the reference of a comparison, and what is said about it."""
+"""The integrator that renders the reference of a comparison, and the messages about it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _fog_in_an_instance():
     ids=["glass", "point", "point-and-glass", "beam", "fog", "smoke", "instance", "coloured-fog",
          "coloured-smoke", "motion"],
 )  # fmt: skip
-def test_the_reference_is_by_an_integrator_that_sees_the_whole_scene(scene, expected):
+def test_the_reference_comes_from_an_integrator_that_sees_the_whole_scene(scene, expected):
     loaded = compare.load_scene(scene(), keep_integrator=False)
     chosen = choose_integrator(loaded)
     assert chosen.integrator == expected

@@ -68,7 +68,7 @@ def test_report_is_one_file_that_loads_nothing(full: Path):
     assert anchors <= set(document.ids)
 
 
-def test_what_comes_from_results_is_text(full: Path):
+def test_results_are_escaped_as_text(full: Path):
     html = (full / "report.html").read_text(encoding="utf-8")
     document = Document(html)
     assert document.scripts == 1
@@ -76,7 +76,7 @@ def test_what_comes_from_results_is_text(full: Path):
     assert HOSTILE in document.text
 
 
-def test_report_says_first_what_went_wrong(full: Path):
+def test_the_report_begins_with_errors(full: Path):
     html = (full / "report.html").read_text(encoding="utf-8")
     top = Document(html[: html.index("<nav")]).text
     assert "Interrupted." in top
@@ -92,7 +92,7 @@ def test_finished_comparison_does_not_say_interrupted(tmp_path: Path):
     assert "Interrupted" not in html and 'class="notice' not in html
 
 
-def test_figures_stand_with_their_intervals(full: Path):
+def test_figures_are_shown_with_their_intervals(full: Path):
     text = Document((full / "report.html").read_text(encoding="utf-8")).text
     assert "Figures at 64 samples per pixel" in text
     assert "2 other levels" in text
@@ -106,7 +106,7 @@ def test_same_results_give_the_same_file(full: Path):
     assert write_report(full).read_bytes() == before
 
 
-def test_main_table_is_of_the_largest_level_that_all_have(tmp_path: Path):
+def test_the_main_table_shows_the_largest_common_level(tmp_path: Path):
     scene = make_scene(tmp_path, "one", (32, 32), [4, 16], ["path", "slow"])
     slow = scene["integrators"][1]
     slow["levels"].pop()
@@ -192,7 +192,7 @@ def lose_errors_in_noise(folder: Path, scene: dict[str, Any]) -> None:
         (lose_errors_in_noise, ""),
     ],
 )
-def test_report_is_written_whatever_is_missing(tmp_path: Path, harm: Callable, words: str):
+def test_a_report_is_written_if_files_are_missing(tmp_path: Path, harm: Callable, words: str):
     scene = make_scene(tmp_path, "one", (32, 32), [4, 16], ["path", "other"])
     harm(tmp_path, scene)
     assert words in write(tmp_path, make_results([scene], "sweep", [4, 16]))

@@ -1,4 +1,4 @@
-"""The report of a comparison: how it behaves in a browser."""
+"""The report of a comparison in a browser."""
 
 from __future__ import annotations
 

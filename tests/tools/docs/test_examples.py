@@ -1,4 +1,4 @@
-"""The examples that are not part of another test do run."""
+"""The examples run, unless another test runs them."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def test_mitsuba_still_has_this_fault(fault: Fault, tmp_path: Path, monkeypatch)
     namespace = {"print": judge}
     try:
         exec(PREAMBLE, namespace)
-        # Line numbers are those of the page, also in tracebacks
+        # Line numbers are line numbers of the page, also in tracebacks
         exec(compile("\n" * (fault.line - 1) + fault.code, PAGE, "exec"), namespace)
     finally:
         # Objects that stay alive would be compiled into the kernels of other tests

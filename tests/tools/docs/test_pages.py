@@ -1,4 +1,4 @@
-"""The pages of plugins: what they say is true, and nothing is described twice."""
+"""The pages of plugins are true, and describe nothing twice."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ CHECKPOINT = {"checkpoint_every": {"checkpoint": "kept"}}
 
 
 def make(name: str, **values: object) -> tuple[mi.Object, list[str]]:
-    """A plugin, and those of its parameters that it does not know."""
+    """A plugin, and the names of the parameters that it does not know."""
     properties = mi.Properties(name)
     for key, value in values.items():
         properties[key] = value
@@ -143,7 +143,7 @@ def test_integrators_describe_the_common_parameters_by_reference(name):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_pages_have_what_their_readers_look_for(name):
+def test_pages_have_the_sections_of_a_manual(name):
     page, text = pages.read_page(FILES[name]), FILES[name].read_text()
     prose = " ".join(page.text.split())
     assert page.title.endswith(f"({name})") and f"-{name}:\n" in text and page.parameters
@@ -164,7 +164,7 @@ def test_every_parameter_of_a_page_is_known(name):
 
 
 @pytest.mark.parametrize("name", [*WALKS, "composed_prb", *DECISIONS, *SEQUENCES])
-def test_what_str_shows_is_on_the_page_with_the_same_default(name):
+def test_the_page_has_each_parameter_of_str_with_the_same_default(name):
     text = str(make(name)[0])
     assert text.startswith(f"{name}[\n")
     on_page = described(name)

@@ -365,7 +365,7 @@ def test_hash_of_a_file_follows_its_meshes(variant, tmp_path):
     assert len(hashes) == 2
 
 
-def test_of_a_traceback_that_mitsuba_quotes_only_the_message_is_left(variant, scenes):
+def test_only_the_message_of_a_traceback_that_mitsuba_quotes_is_shown(variant, scenes):
     with pytest.raises(InputError) as error:
         load_scene(scenes / "prism.xml")
     message = str(error.value)
@@ -382,7 +382,7 @@ def test_of_a_traceback_that_mitsuba_quotes_only_the_message_is_left(variant, sc
         assert one_line(RuntimeError(text)) == line
 
 
-def test_what_is_of_another_variant_or_no_scene_is_refused(variant):
+def test_scenes_of_another_variant_and_objects_that_are_no_scenes_are_refused(variant):
     mi.set_variant("scalar_rgb")
     scene = mi.load_dict({**SPHERE_SCENE, "integrator": {"type": "path"}})
     sphere, path = mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "path"})

@@ -42,7 +42,7 @@ def test_a_scene_dict_can_be_loaded_twice(variant):
     np.testing.assert_array_equal(np.array(bitmap), PIXELS)
 
 
-def test_what_moves_has_the_texture_that_it_has_at_rest(variant):
+def test_a_moving_object_has_the_texture_that_it_has_at_rest(variant):
     cube = _cube(mi.Bitmap(PIXELS.copy()))
     moving = _scene(cube={"type": "moving", "translate": [0.4, 0, 0], "what": cube})
     moved = mi.ScalarTransform4f().translate([0.4, 0, 0])

@@ -36,7 +36,7 @@ def integrator(name: str = "composed_path", **parameters) -> mi.Integrator:
     "composed_path", "neepp", "adaptive", "reweighted_lens",
     *(pytest.param(name, marks=pytest.mark.slow) for name in ("bdpt", "pssmlt", "ecoc_dof")),
 ])  # fmt: skip
-def test_a_render_goes_on_where_it_ended(name, scene, tmp_path):
+def test_a_render_continues_where_it_ended(name, scene, tmp_path):
     folder = str(tmp_path / "kept")
     first, second = (integrator(name, checkpoint=folder) for _ in range(2))
     half = np.array(mi.render(scene(), integrator=first, spp=32, seed=3))
@@ -123,7 +123,7 @@ def test_it_can_be_cancelled_and_interrupted(scene, tmp_path):
     ({"type": "adaptive", "nested": {"type": "neepp", "checkpoint": "a"}}, "outermost integrator"),
     ({"type": "variance", "nested": {"type": "neepp", "checkpoint": "a"}}, "outermost integrator"),
 ])  # fmt: skip
-def test_what_cannot_be_kept_is_named(parameters, words):
+def test_integrators_that_cannot_be_kept_are_named(parameters, words):
     with pytest.raises(RuntimeError, match=words):
         mi.load_dict(parameters)
 

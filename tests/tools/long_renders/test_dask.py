@@ -33,7 +33,7 @@ def test_without_dask_one_sentence_says_what_to_install(run, make_scene, tmp_pat
     assert code == 2 and "pip install 'mitsuba_ext[dask]'" in err and err.count("\n") == 1
 
 
-def test_who_renders_is_said_once(run, make_scene, tmp_path):
+def test_workers_and_dask_exclude_each_other(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr",
                        "--dask", "tcp://127.0.0.1:1", "--workers", 2)  # fmt: skip
     assert code == 2 and "--workers and --dask cannot be combined" in err
@@ -43,7 +43,7 @@ def test_who_renders_is_said_once(run, make_scene, tmp_path):
 
 
 class Processes(list):
-    """The processes of workers, and that of their scheduler."""
+    """The processes of the workers, and the process of their scheduler."""
 
     def __init__(self, workers: list[subprocess.Popen], scheduler: subprocess.Popen) -> None:
         super().__init__(workers)
@@ -128,7 +128,7 @@ def _rendered(request: RenderRequest, spp: int, address: str = "", progress=lamb
 
 @pytest.mark.slow
 @pytest.mark.parametrize("specification", ["neepp", "pss_guided"])
-def test_workers_without_the_files_render_what_is_learned_once(
+def test_workers_without_the_files_render_with_the_state_learned_once(
     specification, scenes, tmp_path, monkeypatch
 ):
     """The scene is named by a path that is another one in each process."""

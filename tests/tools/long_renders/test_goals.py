@@ -61,7 +61,7 @@ def test_the_error_of_one_pixel_is_announced():
 # ---- Renders that end ----
 
 
-def test_it_ends_when_the_error_is_small_enough(request_of):
+def test_a_render_ends_when_the_error_is_small_enough(request_of):
     """The announced error is the error of the image."""
     request = request_of("path")
     render = LongRender(BatchRenderer(request), RenderState())

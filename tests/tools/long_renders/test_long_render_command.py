@@ -119,7 +119,7 @@ def test_variants_without_batches_are_named(run, make_scene, tmp_path):
     assert code == 2 and 'a variant such as "llvm_ad_rgb"' in err
 
 
-def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):
+def test_a_signal_saves_the_render_which_continues(run, make_scene, tmp_path, monkeypatch):
     render, seen = BatchRenderer.render, []
 
     def signalled(self, batch, learned):
@@ -178,7 +178,7 @@ def test_a_preview_shows_the_render_while_it_grows(
 
 
 @pytest.mark.parametrize("integrator", ["path", "composed_path"])
-def test_ctrl_c_keeps_the_render_and_ends(run, make_scene, tmp_path, monkeypatch, integrator):
+def test_ctrl_c_saves_the_render_and_ends_it(run, make_scene, tmp_path, monkeypatch, integrator):
     render = BatchRenderer.render
 
     def signalled(self, batch, learned):
@@ -217,7 +217,7 @@ def test_another_render_is_refused(run, make_scene, tmp_path):
 
 
 def test_a_changed_file_is_named(run, make_scene, tmp_path):
-    """Of a scene with an included file, a mesh and a texture."""
+    """The scene has an included file, a mesh and a texture."""
     (tmp_path / "parts.xml").write_text(
         '<scene version="3.0.0"><shape type="ply"><string name="filename" value="mesh.ply"/>'
         '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">'

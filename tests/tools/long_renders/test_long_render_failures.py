@@ -81,7 +81,7 @@ def test_a_full_file_system_keeps_the_state_before(run, make_scene, tmp_path):
     ("-o", "full/a.exr"), ("-o", "full/a.png"), ("-o", "a.exr", "--checkpoint", "full/kept"),
 ], ids=str)  # fmt: skip
 def test_a_full_disk_is_named_before_the_render(run, make_scene, tmp_path, arguments, monkeypatch):
-    """And nothing is left there."""
+    """No file is left there."""
     full = tmp_path / "full"
     full.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(full)]
@@ -116,7 +116,7 @@ def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_pat
 
 @pytest.mark.parametrize("is_kept", [True, False])
 def test_a_failure_keeps_the_image_so_far(run, make_scene, tmp_path, monkeypatch, is_kept):
-    """As when a scheduler is gone, or three workers have died of the same batch."""
+    """Such failures are a lost scheduler, or a batch of which three workers have died."""
     render, kept = BatchRenderer.render, tmp_path / "kept"
 
     def fails(self, batch, learned):

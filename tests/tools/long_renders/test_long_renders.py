@@ -1,4 +1,4 @@
-"""``mitsuba-ext render --checkpoint``: renders that are kept, gone on with, merged and divided."""
+"""``mitsuba-ext render --checkpoint``: renders that are kept, continued, merged and divided."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
 
 
 def test_batches_count_by_their_samples():
-    """Mean and variance are those of all samples, however they are divided into batches."""
+    """Mean and variance do not depend on how the samples are divided into batches."""
     rng = np.random.default_rng(1)
     sizes = [1, 4, 2, 9, 3, 1, 7, 5]
     found = []
@@ -46,7 +46,7 @@ def test_batches_count_by_their_samples():
 
 
 @pytest.mark.parametrize("specification", ["path", "neepp", "ptracer", "composed_path"])
-def test_a_render_that_goes_on_is_the_one_that_was_not_stopped(
+def test_a_continued_render_equals_a_render_that_was_not_stopped(
     specification, request_of, tmp_path
 ):
     request = request_of(specification)
@@ -68,7 +68,7 @@ def test_a_render_that_goes_on_is_the_one_that_was_not_stopped(
         np.testing.assert_allclose(ours, its, rtol=1e-4, atol=1e-7)
 
 
-def test_the_image_is_that_of_all_samples(request_of):
+def test_the_image_is_the_mean_of_all_samples(request_of):
     """With a filter that is wider than a pixel, too: as one film of all batches would have it."""
     request = request_of("path:max_depth=3")
     file = Path(request.scene)
@@ -91,7 +91,7 @@ def test_the_image_is_that_of_all_samples(request_of):
     "pssmlt:chains=64,luminance_samples=1000,bidirectional=false",
 ])  # fmt: skip
 def test_batches_count_by_their_samples_in_the_image_too(specification, request_of):
-    """Also where the weights in the film are not numbers of samples."""
+    """This includes films whose weights are not numbers of samples."""
     request = request_of(specification)
     state = rendered(request, spp=34)
     assert [batch.spp for batch in state.done] == [16, 16, 2]
@@ -101,7 +101,7 @@ def test_batches_count_by_their_samples_in_the_image_too(specification, request_
     np.testing.assert_allclose(ours, state.images.mean[..., :3], rtol=1e-4)
 
 
-def test_who_renders_does_not_matter(request_of):
+def test_the_image_does_not_depend_on_the_worker(request_of):
     """Batches that come back late, or fail twice."""
     request = request_of("path")
     here = rendered(request, spp=96)
@@ -137,7 +137,7 @@ def test_who_renders_does_not_matter(request_of):
 
 
 def test_a_checkpoint_leaves_files_of_the_user_alone(request_of, tmp_path):
-    """Also those that links in the folder lead to."""
+    """This includes the targets of links in the folder."""
     kept, mine = tmp_path / "kept", tmp_path / "mine.txt"
     files = [kept / "job" / "my.running", kept / "job" / "my.crashed", kept / ".state.npz"]
     (kept / "job").mkdir(parents=True)
@@ -166,7 +166,7 @@ def test_a_state_of_another_film_is_damaged(request_of, tmp_path):
 
 
 def test_a_batch_of_another_shape_is_refused(request_of):
-    """As a worker might return it that runs something else."""
+    """A worker with another version could return one."""
     renderer = BatchRenderer(request_of("path"))
     result = renderer.render(Batch(0, 0, 16))
     other = result._replace(image=result.image[:3], contents=result.contents[:3])
@@ -227,7 +227,7 @@ def test_the_state_before_a_damaged_one_is_kept_until_there_is_a_newer(
     assert folder.load().spp == 16
 
 
-def test_a_folder_that_does_not_say_what_it_holds_is_refused(run, make_scene, tmp_path):
+def test_a_folder_without_a_description_is_refused(run, make_scene, tmp_path):
     kept = tmp_path / "kept"
     command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--checkpoint", kept, "--spp")
     assert run(*command, 16)[0] == run(*command, 32)[0] == 0
@@ -246,7 +246,7 @@ def test_two_processes_cannot_use_a_folder(request_of, tmp_path):
             pass
 
 
-def test_what_is_learned_is_learned_once(run, scenes, tmp_path, monkeypatch):
+def test_batches_learn_once(run, scenes, tmp_path, monkeypatch):
     scene, kept = scenes / "cornell_box.xml", tmp_path / "kept"
     command = ("render", scene, "-o", tmp_path / "a.exr", "--size", "8x6",
                "--integrator", LEARNER, "--checkpoint", kept)  # fmt: skip
@@ -269,7 +269,7 @@ def test_what_is_learned_is_learned_once(run, scenes, tmp_path, monkeypatch):
     assert seen[4:] == [(True, False)]
 
 
-def test_a_batch_that_was_interrupted_has_taught_nothing(scenes, monkeypatch):
+def test_an_interrupted_batch_leaves_no_learned_state(scenes, monkeypatch):
     """A second try has the same numbers, on which what was learned depends."""
     scene = str(scenes / "cornell_box.xml")
     renderer = BatchRenderer(RenderRequest(scene, (8, 6), (), LEARNER))

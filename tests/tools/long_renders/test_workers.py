@@ -1,4 +1,4 @@
-"""Those who render the batches of a long render: without the scene's files, late, or dead."""
+"""Workers of a long render that lack the scene's files, are late, or die."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_a_worker_with_another_version_refuses(make_scene, monkeypatch):
 # ---- What is learned ----
 
 
-def test_what_is_learned_is_sent_to_workers_that_lack_it(scenes):
+def test_the_learned_state_is_sent_to_workers_that_lack_it(scenes):
     request = RenderRequest(str(scenes / "cornell_box.xml"), (8, 6), (), LEARNER)
     here = rendered(request)
 
@@ -261,7 +261,7 @@ def _answer(number: int) -> tuple[int, int]:
     return number, os.getpid()
 
 
-def test_a_process_that_dies_costs_what_it_was_doing_and_one_that_hangs_ends_with_the_others():
+def test_a_dying_process_costs_its_task_and_a_hanging_one_ends_with_the_others():
     workers = Workers(2)
     try:
         process = workers.submit(_answer, 1).result(timeout=60)[1]
@@ -310,7 +310,7 @@ def test_a_batch_ends_the_render_sooner_if_it_is_at_fault(make_scene, error, dea
 # ---- References of comparisons ----
 
 
-def test_references_are_those_of_one_process(make_scene, tmp_path):
+def test_references_of_several_processes_agree_with_one_process(make_scene, tmp_path):
     class Backwards(Worker):
         """Results come two at a time, and the later one first."""
 

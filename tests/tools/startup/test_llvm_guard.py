@@ -254,7 +254,7 @@ def test_our_versions_of_mitsuba_are_accepted(
 
 def test_development_build_with_other_meshes_is_refused() -> None:
     class Mesh:
-        """Of Mitsuba 3.10; builds of it called themselves 3.9.1."""
+        """A mesh of Mitsuba 3.10; builds of it called themselves 3.9.1."""
 
         def positions(self) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Plugins are there whatever comes first, the import or the variant, and in each variant."""
+"""Plugins exist in each variant, whether it is selected before the import or after it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
 
 
 def test_every_class_that_derives_from_mitsuba_is_variant_bound() -> None:
-    """Otherwise it keeps the base class of the first variant when another one is selected."""
+    """If it were not, it would keep the base class of the first variant after another is
+    selected."""
     bound, others = set(), []
     classes = [
         node
@@ -136,7 +137,7 @@ assert mi.Bitmap({str(tmp_path / "image.exr")!r}).width() == 4
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono_polarized"])
-def test_an_unsupported_variant_is_refused_in_a_sentence_that_names_those_that_work(variant):
+def test_the_error_for_an_unsupported_variant_names_the_supported_ones(variant):
     names = plugin_folders.plugin_names()["integrators"]
     output = _run(f"""
 import mitsuba_ext, mitsuba as mi

@@ -1,4 +1,4 @@
-"""Slots of ``composed_path``: what a scene can put into them, and errors where it does not fit."""
+"""Slots of ``composed_path``: the decisions that a scene can use, and errors for the others."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _refusal(**slots: Any) -> str:
     ("shadow_test", "spatial_lights", "next_event"),
     ("aperture", "weighted_connections", "connections"),
 ])  # fmt: skip
-def test_a_decision_in_a_wrong_slot_is_told_its_own(slot: str, plugin: str, belongs: str) -> None:
+def test_an_error_names_the_right_slot_of_a_decision(slot: str, plugin: str, belongs: str) -> None:
     message = _refusal(**{slot: {"type": plugin}})
     assert f'"composed_path": the parameter "{slot}"' in message and belongs in message
 
@@ -70,7 +70,7 @@ def test_any_two_words_go_together_or_are_refused_in_a_sentence() -> None:
     ("mis", "best"), ("shadow_test", "never"), ("shadow_test", 1), ("aperture", "uniform"),
     ("time", True),
 ])  # fmt: skip
-def test_a_word_that_is_none_is_named_with_those_that_are(slot: str, value: Any) -> None:
+def test_the_error_for_an_unknown_word_lists_the_known_words(slot: str, value: Any) -> None:
     message = _refusal(**{slot: value})
     words = {
         "directions": "uniform, guided", "next_event": "power, spatial, linear",
@@ -82,7 +82,7 @@ def test_a_word_that_is_none_is_named_with_those_that_are(slot: str, value: Any)
 
 @pytest.mark.parametrize("slot", SLOTS)
 @pytest.mark.parametrize("kind", ["independent", "diffuse"])
-def test_what_is_no_decision_is_refused_in_any_slot(slot: str, kind: str) -> None:
+def test_plugins_that_are_no_decisions_are_refused_in_any_slot(slot: str, kind: str) -> None:
     message = _refusal(**{slot: {"type": kind}})
     assert f'"{slot}"' in message and '"composed_path"' in message
 
@@ -196,7 +196,7 @@ def test_nested_decisions_are_loaded_from_a_file(tmp_path: Path, optimize: bool)
 
 
 def test_renders_of_one_object_share_no_state() -> None:
-    """Nor do integrators in which the same decision is nested."""
+    """Integrators that nest the same decision share none either."""
     lights = mi.load_dict({"type": "learned_lights", "grid": 3})
     roulette = mi.load_dict({"type": "visibility_roulette"})
     one, other = (

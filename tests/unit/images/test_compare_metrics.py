@@ -179,7 +179,7 @@ def noisy_pair(shape=(24, 32), scale=1.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @needs_flip
-def test_flip_is_what_the_package_computes():
+def test_flip_agrees_with_the_package():
     import flip_evaluator
 
     image, reference = noisy_pair()

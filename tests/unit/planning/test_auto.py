@@ -146,7 +146,7 @@ def test_short_renders_learn_nothing() -> None:
     assert_same_image(*images)
 
 
-def test_where_light_paths_cannot_be_tried_it_is_auto_path(
+def test_auto_equals_auto_path_where_light_paths_cannot_be_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)

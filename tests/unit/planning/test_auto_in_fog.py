@@ -75,7 +75,7 @@ def test_photons_replace_camera_paths_of_more_variance(monkeypatch: pytest.Monke
     assert found.mean() == pytest.approx(image(make("sppm"), scene, 256).mean(), rel=0.1)
 
 
-def test_photons_tell_the_second_moment_of_camera_paths_that_hit_lamps_in_glass(
+def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_lamps_in_glass(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     glass, air = (

@@ -1,4 +1,4 @@
-"""Whether what was learned is worth its time."""
+"""The evidence that learning is worth its time."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def test_the_brightest_paths_do_not_decide_alone() -> None:
 
 
 @pytest.mark.parametrize("sums", [np.zeros((2, BATCHES)), -np.ones((2, BATCHES))])
-def test_where_there_is_no_variance_there_is_no_gain(sums: np.ndarray) -> None:
+def test_without_variance_there_is_no_gain(sums: np.ndarray) -> None:
     assert gain_of(sums) == (0.0, 0.0)
 
 
-def test_what_is_uncertain_counts_less() -> None:
+def test_uncertain_gains_count_less() -> None:
     assert is_worth(1.1, 0.0, 1.03) and is_worth(1.1, 0.5, 1.03)
     assert not is_worth(1.1, 1.0, 1.03) and not is_worth(1.02, 0.0, 1.03)
     # Noisy pilots, but much to gain

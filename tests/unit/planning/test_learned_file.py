@@ -1,4 +1,5 @@
-"""What a render has learned can be saved as a whole, and serves the next render of the scene."""
+"""The learned state of a render can be saved as a whole, and serves the next render of the
+scene."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ def _larger_film() -> mi.Sensor:
 
 
 @pytest.mark.parametrize("name", some("lights and roulette", of=LEARNING))
-def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_path: Path) -> None:
+def test_a_restored_render_draws_the_samples_of_the_last_stage(name, tmp_path: Path) -> None:
     """Without pilots: the last stage of the same seed is the whole render."""
     scene, file = _small("rooms"), tmp_path / "learned.npz"
     first = _integrator(LEARNING[name], save_learned=str(file))
@@ -62,14 +63,14 @@ def nothing_kept():
 
 
 @pytest.mark.usefixtures("nothing_kept")
-def test_a_later_render_of_the_scene_uses_what_was_kept_and_no_other_one_does() -> None:
+def test_only_later_renders_of_the_same_scene_use_the_kept_state() -> None:
     scene, keeping = _small("rooms"), {"max_depth": 6, "keep_learned": True}
     first = mi.load_dict({"type": "neepp", **keeping})
     first.render(scene, seed=3, spp=32)
     assert first.statistics.learning_seconds > 0
 
     def learns(scene: mi.Scene, spp: int = 32, sensor: mi.Sensor | int = 0, **more) -> bool:
-        """Does another integrator learn, with another seed?"""
+        """Whether another integrator learns, with another seed."""
         integrator = mi.load_dict({"type": "neepp", **keeping, **more})
         view = scene.sensors()[0] if sensor == 0 else sensor
         plan = integrator.plan_learning(scene, view, spp)
@@ -92,7 +93,7 @@ def test_a_later_render_of_the_scene_uses_what_was_kept_and_no_other_one_does() 
 
 @pytest.mark.usefixtures("nothing_kept")
 @pytest.mark.parametrize("name", ["auto", pytest.param("adaptive", marks=pytest.mark.slow)])
-def test_kept_renders_draw_what_loaded_ones_draw(name, tmp_path: Path) -> None:
+def test_kept_and_loaded_states_draw_the_same_samples(name, tmp_path: Path) -> None:
     scene, file = _small("rooms"), str(tmp_path / "learned.npz")
 
     def make(**parameters) -> mi.Integrator:
@@ -126,7 +127,7 @@ def test_load_learned_excludes_keep_learned() -> None:
 
 
 @pytest.mark.slow
-def test_restored_decisions_are_those_that_were_saved(tmp_path: Path) -> None:
+def test_restored_decisions_equal_the_saved_ones(tmp_path: Path) -> None:
     """The tables themselves, bit for bit."""
     scene, file = _small("rooms"), tmp_path / "learned.npz"
     integrator = mi.load_dict({

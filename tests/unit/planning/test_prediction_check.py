@@ -80,7 +80,7 @@ def test_a_choice_that_is_worse_than_predicted_is_seen(efficiency: float) -> Non
     check = PredictionCheck(film, coarse, of_path)
     assert not check.failed(time=9.0, rival=9.0)
     fill(check.images, film, FEWEST_PASSES)
-    # The variance is that of ``path``
+    # ``path`` has this variance
     failed = check.failed(time=2 / efficiency, rival=0.5)
     assert check.variance == pytest.approx(1, rel=0.05)
     assert failed == (efficiency < 0.9)
@@ -148,8 +148,8 @@ def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
     assert (choice is None) == merges
 
 
-def test_going_back_brings_back_the_guide_as_it_is() -> None:
-    """Not as it would be with the samples of all pilots, nor with the margin of the choice."""
+def test_going_back_restores_the_guide_as_it_was() -> None:
+    """It has neither the samples of later pilots nor the margin of the choice."""
     guide = GuideLearner.__new__(GuideLearner)
     guide.guide, guide.guidance = True, SimpleNamespace(efficiency=2.0)
     guide.finish = lambda: None
@@ -177,7 +177,7 @@ def test_going_back_brings_back_the_guide_as_it_is() -> None:
     assert rivals[0] > 2.5 and rivals[1] == pytest.approx(2.0)
 
 
-def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_goes_back_to_its_earlier_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
 
     def failed(check: PredictionCheck, time: float, rival: float) -> bool:

@@ -73,7 +73,7 @@ def test_a_material_reflects_light_as_in_path(name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", some("dielectric", of=["dielectric", "conductor", "plastic"]))
-def test_caustics_are_those_of_path(kind: str) -> None:
+def test_caustics_agree_with_path(kind: str) -> None:
     assert_image_of_path(stage_with_ball({"type": kind}), 5, precision=0.01)
 
 
@@ -136,7 +136,7 @@ def test_three_connections_in_other_variants_show_the_image_of_path(variant: str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
-def test_dispersed_light_is_that_of_the_path_tracer(variant: str) -> None:
+def test_dispersed_light_agrees_with_the_path_tracer(variant: str) -> None:
     scene = load("flint", width=24, height=24)
     assert_image_of_path(scene, 4, 256, 0.01, reference="composed_path")
 

@@ -1,4 +1,4 @@
-"""``composed_prb``: its gradients are those of ``prb`` and of finite differences."""
+"""The gradients of ``composed_prb`` agree with ``prb`` and with finite differences."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def keys_of(parameters: mi.SceneParameters) -> list[str]:
 
 
 @pytest.mark.parametrize("more", [{}, {"hide_emitters": True}], ids=str)
-def test_with_all_defaults_gradients_are_those_of_prb(more: dict[str, Any]) -> None:
+def test_with_all_defaults_gradients_agree_with_prb(more: dict[str, Any]) -> None:
     """They use the same random numbers."""
     scene = room()
     parameters = small(scene)
@@ -182,7 +182,7 @@ def test_forward_and_backward_mode_agree_with_finite_differences(kind: str) -> N
         assert abs(np.mean(found) - expected) < 4.5 * error + 0.01 * abs(expected)
 
 
-def test_what_is_black_has_a_gradient() -> None:
+def test_black_objects_have_a_gradient() -> None:
     """A connection that carries nothing may have a derivative nonetheless."""
     scene = mi.load_dict(stage(floor=rectangle(mi.ScalarTransform4f().scale(2),
                                                bsdf=diffuse(0.0))), optimize=False)  # fmt: skip
@@ -196,7 +196,7 @@ def test_what_is_black_has_a_gradient() -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0.02)
 
 
-def test_the_image_is_that_of_composed_path_and_later_renders_learn_nothing() -> None:
+def test_the_image_agrees_with_composed_path_and_later_renders_learn_nothing() -> None:
     scene = load("rooms", width=48, height=27)
     ours, path = (
         np.array(make(name, next_event="power").render(scene, spp=8, seed=4))
@@ -269,7 +269,7 @@ def test_gradients_of_another_scene_in_memory_refuse_no_render() -> None:
     assert plain.render(other, spp=1).numpy().mean() > 0
 
 
-def test_what_has_no_gradients_is_refused() -> None:
+def test_decisions_without_gradients_are_refused() -> None:
     scene = mi.load_dict(stage(), optimize=False)
     parameters = small(scene)
     key = next(key for key in parameters.keys() if key.endswith("to_world"))

@@ -1,4 +1,4 @@
-"""Depth of field by a filter: near what a thin lens shows, whatever the film, and clear errors."""
+"""Depth of field by a filter is close to a thin lens on any film; errors are clear."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.mark.slow
-def test_picture_is_near_that_of_a_thin_lens_and_nearer_than_that_of_the_source():
+def test_picture_is_closer_to_a_thin_lens_than_the_filter_of_the_source():
     scene = signs()
     reference = rendered(scene, mi.load_dict(EMITTED), 4096)
     error = {
@@ -41,7 +41,7 @@ def test_a_white_film_stays_white(changes):
     assert np.allclose(image, 1, rtol=1e-3)
 
 
-def test_corners_of_wide_circles_see_what_lies_far_around_the_film():
+def test_corners_of_wide_circles_see_objects_far_around_the_film():
     """A white panel ends 4.5 of 32 pixels beside the film, where circles have a radius of 8."""
     place = mi.ScalarTransform4f().translate([0, -2, 0.6]).rotate([1, 0, 0], 90)
     # At the distance of the panel, half of the film is 2 tan(22.5°) = 0.828 wide
@@ -81,14 +81,14 @@ def test_equal_seeds_give_equal_images():
 
 
 @pytest.mark.parametrize("spp, hidden_spp", [(1, 0), (3, 2), (9, 0)])
-def test_few_samples_are_enough_and_are_those_of_the_image(spp, hidden_spp):
+def test_few_samples_are_enough_and_count_in_the_image(spp, hidden_spp):
     scene = mi.load_dict(stage(camera=thin_lens(1, 1) if spp == 3 else thin_lens(5, 3)))
     integrator = ecoc(PATH, hidden_spp=hidden_spp)
     image = rendered(scene, integrator, spp)
     assert np.isfinite(image).all() and integrator.statistics.spp == spp
 
 
-def test_a_cancelled_render_is_a_picture_of_what_it_has():
+def test_a_cancelled_render_is_a_picture_of_its_finished_samples():
     scene = mi.load_dict(stage(camera=thin_lens(5, 3)))
     integrator = ecoc(PATH)
     integrator.samples_per_pass = 2
@@ -128,14 +128,14 @@ def test_any_integrator_that_samples_camera_rays_can_be_nested(nested):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
-def test_brightness_is_that_of_the_thin_lens_in_other_variants(variant):
+def test_brightness_agrees_with_the_thin_lens_in_other_variants(variant):
     scene = mi.load_dict(stage(camera=thin_lens()))
     image, path = rendered(scene, ecoc(PATH), 128), rendered(scene, mi.load_dict(PATH), 512)
     assert image.mean() == pytest.approx(path.mean(), rel=0.05)
 
 
 @pytest.mark.slow
-def test_panes_and_holes_are_not_there_for_the_layers():
+def test_layers_look_through_panes_and_holes():
     """A mask that lets everything through stands before the lens."""
     hole = {"type": "mask", "opacity": 0.0, "bsdf": diffuse(0.5)}
     place = mi.ScalarTransform4f().translate([0, -3.2, 1]).rotate([1, 0, 0], 90)

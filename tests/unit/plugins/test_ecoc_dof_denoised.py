@@ -40,14 +40,14 @@ def test_a_denoiser_that_changes_nothing_leaves_the_picture_alone(calls):
     assert any(np.allclose(call.normal[below], [0, 0, 1], atol=1e-3) for call in calls)
 
 
-def test_holes_of_a_layer_are_no_edges_for_the_denoiser(calls):
-    """A panel near the lens, and lamps around it: the near layer is that of the panel alone."""
+def test_the_denoiser_sees_no_edges_at_holes_of_a_layer(calls):
+    """A panel near the lens, and lamps around it: the near layer holds the panel alone."""
     rendered(signs(rfilter={"type": "box"}), ecoc(denoise=True), 4)
     near = calls[0].color
     assert np.allclose(near, 0.1, rtol=1e-3), "the panel's radiance everywhere"
 
 
-def test_lights_stay_as_they_are(monkeypatch):
+def test_lights_are_not_denoised(monkeypatch):
     """All that is seen are lights; the denoiser makes everything brighter."""
     brighter = SimpleNamespace(denoise=lambda color, albedo, normal, *, hdr: 2 * color)
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", brighter)
@@ -63,7 +63,7 @@ def test_a_missing_package_is_named(monkeypatch):
 
 
 @pytest.mark.slow
-def test_noise_becomes_less_and_edges_stay():
+def test_noise_is_reduced_and_edges_stay():
     pytest.importorskip("mitsuba_oidn")
     scene = mi.load_dict(stage(camera=thin_lens(64, 48, rfilter={"type": "box"})))
     reference = rendered(scene, ecoc(PATH), 512)

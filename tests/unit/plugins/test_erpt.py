@@ -1,4 +1,4 @@
-"""``erpt`` renders what ``path`` renders, however much of the energy chains redistribute."""
+"""``erpt`` renders what ``path`` renders, for any share of the energy that chains redistribute."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_perturbation_alone_keeps_the_mean(which: str) -> None:
 
 
 @pytest.mark.slow
-def test_chains_of_paths_leave_a_furnace_as_it_is() -> None:
+def test_chains_of_paths_keep_the_radiance_of_a_furnace() -> None:
     """A room that reflects half of its light: both parts of it, the outliers' energy too."""
     room = {"type": "sphere", "radius": 6.0, "flip_normals": True, "emitter": area(1.0),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
@@ -79,7 +79,7 @@ def test_chains_of_paths_leave_a_furnace_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("key", ["bidirectional", "next_event", "proposal_filter"])
-def test_what_chains_of_paths_have_no_use_for_is_refused(key: str) -> None:
+def test_parameters_that_chains_of_paths_do_not_use_are_refused(key: str) -> None:
     value = {"bidirectional": True, "next_event": "spatial", "proposal_filter": 7}[key]
     with pytest.raises(RuntimeError, match=f'"{key}" is for chains of primary samples'):
         erpt(mutations="path", **{key: value})
@@ -106,8 +106,8 @@ def test_the_number_of_mutations_follows_the_energy() -> None:
     assert samples == pytest.approx(64 * pixels, rel=0.15)
 
 
-def test_samples_start_as_many_chains_as_they_hold_energies() -> None:
-    """On average over the random offset, which is that of the seed."""
+def test_samples_start_chains_in_proportion_to_their_energy() -> None:
+    """On average over the random offset, which follows from the seed."""
     ramp, counts = TARGETS["ramp"][0], []
     for seed in range(1, 65):
         samples = Bootstrap(ramp, seed, 64)
@@ -133,7 +133,7 @@ def test_cancelling_leaves_a_sound_image() -> None:
 def test_an_error_amid_a_batch_leaves_the_batches_before_it(
     monkeypatch: pytest.MonkeyPatch, chains: bool
 ) -> None:
-    """Also a second Ctrl-C, in chains or in samples: half of a batch would not have the right
+    """A second Ctrl-C does too, in chains or in samples: half of a batch would have a wrong
     mean."""
     monkeypatch.setattr(RedistributionRender, "max_batch", 16 * 16 * 16)
     scene, integrator = mi.load_dict(stage(glass=GLASS_BALL)), erpt(outliers=1.0, direct_samples=8)

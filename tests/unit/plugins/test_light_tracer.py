@@ -1,4 +1,4 @@
-"""Light tracing shows the image of ``path``, where it can see it."""
+"""Light tracing shows the image of ``path`` wherever light paths can be seen."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def assert_image_of_path(
     reference: dict[str, Any] | None = None,
     **parameters: Any,
 ) -> None:
-    """The means of the image and of its quarters are those of ``path``."""
+    """The means of the image and of its quarters agree with ``path``."""
     path = {"type": "path", **(reference or {}), "max_depth": max_depth, **parameters}
     images = batches(scene, light_tracer(max_depth, **parameters), spp, SEEDS[:MANY_SEEDS])
     expected = batches(scene, mi.load_dict(path), spp, REFERENCE_SEEDS[:MANY_SEEDS])
@@ -125,7 +125,7 @@ def test_a_material_reflects_light_as_in_path(name: str) -> None:
 @pytest.mark.parametrize(
     "kind", some("dielectric", of=["dielectric", "conductor", "thindielectric"])
 )
-def test_caustics_are_those_of_path(kind: str) -> None:
+def test_caustics_agree_with_path(kind: str) -> None:
     """The camera looks at the floor only, and not through the glass above it."""
     lamp = rectangle(T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180), emitter=area(5.0),
                      bsdf=diffuse(0.0))  # fmt: skip
@@ -213,11 +213,11 @@ def test_passes_and_rounds_share_their_kernels() -> None:
     assert integrator.statistics.passes == 8
     # Small ones compile in no time
     compiled = [k for k in kernels if not k["cache_hit"] and k["operation_count"] > 100]
-    # The last rounds may have so few vertices that they need a kernel of their own
+    # The last rounds may have few vertices, for which another kernel is compiled
     assert len(compiled) <= 3, [k["operation_count"] for k in compiled]
 
 
-def test_what_cannot_be_seen_is_said_once(capfd: pytest.CaptureFixture) -> None:
+def test_light_that_it_cannot_see_is_mentioned_once(capfd: pytest.CaptureFixture) -> None:
     ball = {"type": "sphere", "bsdf": {"type": "dielectric"}}
     integrator = light_tracer()
     for scene in (stage(), stage(ball=ball), stage(ball=ball)):

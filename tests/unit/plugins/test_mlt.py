@@ -140,7 +140,7 @@ def test_techniques_are_chosen_as_often_as_they_say() -> None:
 
 
 @pytest.mark.parametrize("name", some("caustic_perturbation", of=SWITCHES))
-def test_a_mutation_alone_leaves_the_image_as_it_is(name: str) -> None:
+def test_a_single_mutation_keeps_the_mean(name: str) -> None:
     """Chains begin where they belong: what moves them must not bring them elsewhere."""
     scene = mi.load_dict({**stage_with_ball(SPECULAR["glass"]()), "light": EMITTERS["constant"]()},
                          optimize=False)
@@ -154,7 +154,7 @@ def test_a_mutation_alone_leaves_the_image_as_it_is(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "spp"), [("lens_perturbation", 64), ("caustic_perturbation", 512)]
 )
-def test_perturbations_of_a_floor_at_a_small_angle_leave_the_image_as_it_is(
+def test_perturbations_of_a_floor_at_a_small_angle_keep_the_mean(
     name: str, spp: int
 ) -> None:
     """From the nearest to the farthest part of the floor, the geometric factor of a direction of
@@ -177,7 +177,7 @@ def test_perturbations_of_a_floor_at_a_small_angle_leave_the_image_as_it_is(
 
 
 def test_solid_angles_change_at_refraction_as_the_lobe_ratio_says() -> None:
-    """Of a cone of directions around one, by finite differences."""
+    """The solid angle of a cone of directions, by finite differences."""
     bsdf = mi.load_dict({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0})
     for cosine in (0.8, -0.8):
         wi = dr.normalize(mi.Vector3f(0.6 + mi.Float(0, 2e-3, 0), mi.Float(0, 0, 2e-3), cosine))
@@ -216,7 +216,7 @@ def test_mutations_keep_caustics(name: str) -> None:
 
 @pytest.mark.slow
 def test_short_renders_are_right_on_average() -> None:
-    """Of one mutation per pixel."""
+    """They have one mutation per pixel."""
     scene = mi.load_dict(stage(), optimize=False)
     images = batches(scene, mlt(**ALONE), 1, range(1, 65))
     expected = batches(scene, path(4), 1024, REFERENCE_SEEDS[:MANY_SEEDS])

@@ -1,5 +1,5 @@
 """Photon mapping in two passes: its images against ``path``, its maps, and what it refuses.
-(``techniques.py`` has the tests that all integrators share.)"""
+(``tests/claims`` has the tests that all techniques share.)"""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make(max_depth: int = 6, **parameters: Any) -> mi.Integrator:
     pytest.param({"final_gather": False}, marks=pytest.mark.slow),
     pytest.param({"next_event": "power"}, marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_the_mean_is_that_of_path(parameters: dict) -> None:
+def test_the_mean_agrees_with_path(parameters: dict) -> None:
     """Each path from a light to the camera belongs to one part of the estimate: direct light,
     caustics, gathered light, by way of all kinds of surfaces."""
     scene = mi.load_dict(stage(**shiny_things()), optimize=False)
@@ -35,7 +35,7 @@ def test_the_mean_is_that_of_path(parameters: dict) -> None:
 
 
 @pytest.mark.parametrize("parameters", [{"guided": True}, {"final_gather": False}])
-def test_direct_light_is_that_of_path(parameters: dict) -> None:
+def test_direct_light_agrees_with_path(parameters: dict) -> None:
     scene = mi.load_dict(stage(**shiny_things()), optimize=False)
     found = batches(scene, make(2, photons=1 << 14, **parameters), 256, range(1, 9))
     expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 2}), 256, range(101, 109))

@@ -52,7 +52,7 @@ _SHORT = {
 
 @pytest.mark.parametrize("which", some("few chains", of=_SHORT))
 def test_short_renders_are_right_on_average(which: str) -> None:
-    """Of one mutation per pixel: chains are where they belong from the beginning."""
+    """One mutation per pixel is enough: chains have the right distribution from the beginning."""
     parameters = {**ALONE, **_SHORT[which]}
     scene = mi.load_dict(stage(), optimize=False)
     images = batches(scene, pssmlt(**parameters), 1, range(1, 33))
@@ -62,7 +62,7 @@ def test_short_renders_are_right_on_average(which: str) -> None:
 
 @pytest.mark.parametrize("max_depth", [0, 1, 2])
 def test_camera_samples_alone_find_short_paths(max_depth: int) -> None:
-    """They are those of ``path``; chains have nothing to find."""
+    """The image agrees with ``path``; chains have nothing to find."""
     scene, integrator = mi.load_dict(stage()), pssmlt(max_depth)
     image, path = (batches(scene, i, 16, [5])[0] for i in (integrator, REFERENCE.make(max_depth)))
     assert path.any() == (max_depth > 0)
@@ -172,7 +172,7 @@ def test_an_error_in_the_progress_callback_leaves_the_image_so_far() -> None:
 
 
 def test_the_timeout_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock goes by mutations. The image is that of as many mutations as fit."""
+    """The clock counts mutations. The image has the mutations that fit into the time."""
     scene = mi.load_dict(stage())
     (whole,) = batches(scene, pssmlt(chains=256), 512, [5])
     clock, advance = PassClock(monkeypatch), LoopedChains.advance
@@ -214,8 +214,8 @@ def test_statistics_count_rays_and_acceptance() -> None:
     assert re.fullmatch(r"a chain stayed at one path for \d+ of \d+ mutations", stay)
 
 
-def test_a_warning_tells_that_the_brightness_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the standard error of the samples from which chains started."""
+def test_uncertain_brightness_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The criterion is the standard error of the samples from which chains started."""
     said: list[str] = []
     monkeypatch.setattr(mi, "Log", lambda level, text: level < mi.LogLevel.Warn or
                         said.append(text))  # fmt: skip
@@ -226,8 +226,8 @@ def test_a_warning_tells_that_the_brightness_is_not_known(monkeypatch: pytest.Mo
         assert len(said) == 1 and '"luminance_samples"' in said[0], said
 
 
-def test_a_warning_tells_that_a_chain_stayed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its visits, in units of those of a pixel."""
+def test_a_chain_that_stays_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stay is measured by the visits, relative to the visits of a pixel."""
     told: list[str] = []
     monkeypatch.setattr(mi, "Log", lambda level, text: told.append(text))
     monkeypatch.setattr(MetropolisRender, "long_stay", 1)
@@ -270,7 +270,7 @@ def test_it_cannot_be_nested_where_single_samples_are_asked_for(outer: str) -> N
         nesting.render(mi.load_dict(stage()), spp=1)
 
 
-def test_variance_can_hold_it() -> None:
+def test_variance_can_nest_it() -> None:
     scene = mi.load_dict(stage())
     nested = {"type": "pssmlt", "bidirectional": False, "max_depth": 4, **_FOUR_PER_PIXEL}
     integrator = mi.load_dict({"type": "variance", "nested": nested, "batches": 4})

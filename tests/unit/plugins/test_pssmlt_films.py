@@ -64,7 +64,7 @@ def test_every_pixel_has_its_light_up_to_the_edges(name: str) -> None:
 
 
 @pytest.mark.parametrize("direct", some(-1, of=[-1, 16]))
-def test_alpha_and_output_variables_are_those_of_the_camera_samples(direct: int) -> None:
+def test_alpha_and_output_variables_come_from_the_camera_samples(direct: int) -> None:
     aovs = "depth:depth,normal:sh_normal"
     camera = sensor(film=film(pixel_format="rgba", rfilter={"type": "gaussian"}))
     scene = mi.load_dict(stage(camera=camera, wall=None))
@@ -141,7 +141,7 @@ def test_moving_shapes_are_blurred_as_by_the_path_tracer(direct: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
-def test_dispersive_glass_is_that_of_the_path_tracer(variant: str) -> None:
+def test_dispersive_glass_agrees_with_the_path_tracer(variant: str) -> None:
     """Each channel: a hero wavelength that goes astray would colour the image."""
     lamp = rectangle(T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180), emitter=area(5.0),
                      bsdf=diffuse(0.0))  # fmt: skip

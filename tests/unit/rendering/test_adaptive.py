@@ -1,4 +1,5 @@
-"""Adaptive samples: unbiased, where the error is, none starved."""
+"""Adaptive samples are unbiased, go where the error is large, and leave no pixel without
+samples."""
 
 from __future__ import annotations
 
@@ -85,7 +86,7 @@ def test_no_pixel_is_starved_and_the_sum_is_kept():
     assert sets.argmax() == 100
 
 
-def test_variance_of_sets_is_that_of_their_means():
+def test_the_variance_of_sets_is_the_variance_of_their_means():
     """Stratified samples vary within a set, and less between sets."""
     moments = PixelMoments(1, 1, set_size=4)
     moments.add(np.zeros(8, int), np.tile([0.0, 1.0, 2.0, 3.0], 8))
@@ -135,7 +136,7 @@ def test_mean_of_64_short_renders_of_a_rare_lamp(is_naive, monkeypatch):
     pytest.param({"type": "neepp", "max_depth": 3}, marks=pytest.mark.slow),
     pytest.param({"type": "bdpt", "max_depth": 3, "light_image": False}, marks=pytest.mark.slow),
 ], ids=lambda nested: nested["type"])  # fmt: skip
-def test_mean_is_that_of_the_nested_integrator(nested):
+def test_mean_agrees_with_the_nested_integrator(nested):
     scene = small(rfilter={"type": "gaussian"})
     images = batches(scene, adaptive(nested), 64, range(8))
     assert_images_are_sound(images)
@@ -204,7 +205,7 @@ def test_few_samples_are_enough(spp):
     assert np.isfinite(image).all() and integrator.statistics.spp == spp
 
 
-def test_a_cancelled_render_keeps_what_it_has():
+def test_a_cancelled_render_keeps_its_finished_samples():
     scene = small(8, 8)
     integrator = adaptive()
     integrator.progress = lambda done: integrator.cancel() if done > 0.3 else None

@@ -51,7 +51,7 @@ class _Clock:
         monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
 
 
-def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
+def test_the_pilots_are_planned_for_the_samples_that_fit_into_the_time(monkeypatch):
     clock, asked = _Clock(monkeypatch), []
     integrator = _integrator("auto_path", timeout=10.0)
     plan = integrator.plan_learning
@@ -141,7 +141,7 @@ def test_the_samples_that_measure_the_speed_are_part_of_the_image(monkeypatch):
     assert timed.mean() == pytest.approx(path.mean(), rel=0.03)
 
 
-def test_without_a_timeout_the_plan_is_that_of_all_samples(monkeypatch):
+def test_without_a_timeout_the_plan_is_made_for_all_samples(monkeypatch):
     def never(*_):
         raise AssertionError
 
@@ -201,7 +201,7 @@ def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
     assert not compiled[2] and not compiled[3]
 
 
-def test_the_mean_of_the_channels_is_that_of_dr():
+def test_the_mean_of_the_channels_agrees_with_drjit():
     colour = mi.Color3f([1, 4], [2, 5], [6, 0])
     np.testing.assert_allclose(channel_mean(colour).numpy(), [3, 3])
 

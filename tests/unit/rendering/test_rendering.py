@@ -125,7 +125,7 @@ def _path(name: str = "composed_path", **parameters) -> mi.Integrator:
 
 @pytest.mark.parametrize("sampler, spp, length", [("independent", 40, 14), ("stratified", 36, 1)])
 def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampler, spp, length):
-    """But for samplers that hold a state for each sample."""
+    """Samplers that hold a state for each sample are the exception."""
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
     job = rendering.Job(_path(), scene, sensor, 0, spp)
@@ -234,7 +234,7 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     assert pilot <= 0.25 * done + 2
 
 
-def test_compilation_counts_towards_the_timeout_but_tells_no_speed(scene, monkeypatch):
+def test_compilation_counts_towards_the_timeout_but_not_as_speed(scene, monkeypatch):
     clock = PassClock(monkeypatch, compiling=1)
     integrator = _TwoStages(pilot_spp=4, timeout=9.0)
     integrator.render(scene, 1000)
@@ -346,7 +346,7 @@ def test_passes_share_kernels_and_memory(scene):
     # 7²: only 1 and 7 samples divide the square of a prime
     [("independent", 256), ("stratified", 256), ("orthogonal", 49), ("ldsampler", 256)],
 )
-def test_many_passes_estimate_what_one_does(scene, sampler, spp, monkeypatch):
+def test_many_passes_have_the_mean_of_one_pass(scene, sampler, spp, monkeypatch):
     sensor = mi.load_dict(
         {"type": "perspective", "sampler": {"type": sampler},
          "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
@@ -393,7 +393,7 @@ def test_render_takes_the_arguments_that_mitsuba_takes(scene):
         integrator.render(scene, sensor=1)
 
 
-def test_statistics_tell_compiling_from_tracing() -> None:
+def test_statistics_separate_compiling_from_tracing() -> None:
     scene = mi.load_dict(stage())
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
     for _ in range(2):

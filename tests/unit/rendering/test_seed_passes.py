@@ -1,4 +1,4 @@
-"""Mitsuba's own integrators in passes over seeds: the film is that of one render."""
+"""Mitsuba's own integrators in passes over seeds fill the film as one render does."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seed_passes, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 1})
 
 
-def test_seeds_of_passes_are_none_of_batches() -> None:
+def test_seeds_of_passes_differ_from_seeds_of_batches() -> None:
     for seed in (0, 7):
         passes = mi.sample_tea_32(mi.UInt32(seed), seed_passes._STREAM + dr.arange(mi.UInt32, 64))
         assert not set(passes[1].numpy().tolist()) & set(batch_seeds(seed, 4096))
@@ -38,7 +38,7 @@ def test_seeds_of_passes_are_none_of_batches() -> None:
     [{"rfilter": {"type": "lanczos"}, "sample_border": True}, {"pixel_format": "luminance_alpha"}],
     ids=["negative lobes", "luminance"],
 )
-def test_the_film_is_what_all_samples_make_together(monkeypatch, integrator, film):
+def test_the_film_holds_the_mean_of_all_samples(monkeypatch, integrator, film):
     """Passes of 4, 4 and 2 samples."""
     scene, integrator = small_scene(7, 5, **film), mi.load_dict(integrator)
     sensor, kept = scene.sensors()[0], []
@@ -73,7 +73,7 @@ def test_the_film_is_what_all_samples_make_together(monkeypatch, integrator, fil
     assert names == list(integrator.aov_names())
 
 
-def test_a_short_render_is_that_of_the_integrator():
+def test_a_short_render_is_the_integrators_own_image():
     scene, path = small_scene(6, 5), mi.load_dict({"type": "path"})
     sensor = scene.sensors()[0]
     expected = path.render(scene, seed=2**32 - 1, spp=4).numpy()

@@ -1,4 +1,4 @@
-"""Light that an estimator brings to other pixels than those of its camera rays."""
+"""Light that an estimator brings to pixels other than the pixels of its camera rays."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _CROP = {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 13, "crop_height"
 @pytest.mark.parametrize("changes", [{}, _GAUSSIAN, _CROP, {**_GAUSSIAN, **_CROP}],
                          ids=["box", "gaussian", "cropped", "gaussian-cropped"])  # fmt: skip
 def test_splats_at_their_own_place_are_the_image(changes: dict[str, Any], sampler: str) -> None:
-    """Divided by the mean of the filter weights, not by those of the samples."""
+    """Splats are divided by the mean filter weight, and not by the weights of the samples."""
     scene = _scene(sampler, **changes)
     ours, image = (batches(scene, _integrator(shift), 16, [4])[0] for shift in ((0, 0), None))
     assert image.mean() > 0
@@ -64,8 +64,8 @@ def test_splats_at_their_own_place_are_the_image(changes: dict[str, Any], sample
 
 
 def test_splats_are_right_on_average_with_one_camera_sample() -> None:
-    """Also with a filter whose weights depend on where that falls in its pixel: dividing by them
-    would be 6 % too bright."""
+    """This includes a filter whose weights depend on the position in the pixel: dividing by these
+    weights would make the image 6 % too bright."""
     camera = sensor(film=film(24, 20, **_GAUSSIAN))
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "camera": camera})
     images = batches(scene, _integrator((3, 0)), 1, range(1, 33))
@@ -101,7 +101,7 @@ def test_splats_are_spread_by_the_filter() -> None:
     np.testing.assert_allclose(ours[:, 5:-2], image[:, 2:-5], atol=0.05 * inside, rtol=0.05)
 
 
-def test_alpha_and_output_variables_are_those_of_the_camera_rays() -> None:
+def test_alpha_and_output_variables_come_from_the_camera_rays() -> None:
     scene = _scene(pixel_format="rgba")
     ours, image = (
         batches(scene, _integrator(shift, aovs="depth:depth"), 16, [4])[0]

@@ -35,7 +35,7 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("nested", [*NESTED, pytest.param("bdpt", marks=pytest.mark.slow)])
-def test_mean_and_variance_are_those_of_the_batches(nested):
+def test_mean_and_variance_are_computed_over_the_batches(nested):
     scene, inner = small_scene(9, 7), mi.load_dict({"type": nested})
     image = mi.render(scene, integrator=with_variance(nested), spp=32, seed=5).numpy()
     images = [
@@ -74,7 +74,7 @@ def lattice(variant: str) -> mi.Scene:
 
 
 @pytest.mark.parametrize("batches", [2, 16])
-def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
+def test_the_variance_belongs_to_the_mean_of_all_samples(lattice, batches):
     """Bernoulli: p (1 − p) / spp. The pixels are independent."""
     spp, p = 64, 0.3
     image = mi.render(lattice, integrator=with_variance("direct", batches), spp=spp, seed=1).numpy()
@@ -136,7 +136,7 @@ def test_seeds_of_batches_are_not_shared():
     assert not set(mi.sample_tea_32(mi.UInt32(0), dr.arange(mi.UInt32, 64))[0]) & set(seeds[0])
 
 
-def test_batches_come_one_by_one_and_can_be_gone_on_with(tmp_path):
+def test_batches_come_one_by_one_and_can_be_continued(tmp_path):
     scene, path = small_scene(6, 5), mi.load_dict({"type": "path"})
     counts = [batches.count for batches in each_batch(path, scene, 0, 4, [7, 8])]
     assert counts == [1, 2]
@@ -194,7 +194,7 @@ def test_no_batch_is_kept(monkeypatch):
         ("orthogonal", 1000, (9, 121)),
     ],
 )
-def test_samples_exceed_those_asked_for_by_less_than_a_batch(sampler, spp, expected):
+def test_samples_exceed_the_request_by_less_than_a_batch(sampler, spp, expected):
     scene, integrator = small_scene(3, 2, sampler=sampler), with_variance("direct", 16)
     integrator.render(scene, spp=spp)
     count, batch_spp = expected
@@ -261,7 +261,7 @@ _CROP_AND_BORDER = {"width": 31, "height": 29, "crop_offset_x": 5, "crop_offset_
     ],
     ids=["one pixel", "mitchell", "float16", "one pixel, neepp", "crop, neepp", "crop, ptracer"],
 )
-def test_odd_films_hold_what_is_returned(nested, changes):
+def test_odd_films_hold_the_returned_image(nested, changes):
     scene = small_scene(**changes)
     # A single pixel has few samples to tell its variance from
     spp = 64 if "crop_width" in changes else 1024
@@ -306,7 +306,7 @@ def test_aovs_of_the_nested_integrator_are_passed_on_as_means():
         "variance.R", "variance.G", "variance.B",
     ]  # fmt: skip
     assert list(film_channels(scene)) == ["R", "G", "B", *mitsubas.aov_names()]
-    # Both see the same camera rays; the image is that of the nested integrator
+    # Both see the same camera rays, and the nested integrator makes the image
     np.testing.assert_allclose(wrapped[..., 7:11], image[..., 3:7], rtol=1e-3, atol=1e-4)
     plain = mi.render(scene, integrator=with_variance("path"), spp=16).numpy()
     np.testing.assert_allclose(wrapped[..., :3], plain[..., :3], rtol=1e-4, atol=1e-6)

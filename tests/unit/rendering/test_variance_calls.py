@@ -1,4 +1,4 @@
-"""The integrator ``variance``: how it is called, what stops it, and what it refuses."""
+"""The integrator ``variance``: its calls, its interruption, and its errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bins of directions of an environment: densities, and what is sampled by them."""
+"""Bins of directions of an environment: their densities, and the samples drawn from them."""
 
 from __future__ import annotations
 
@@ -135,14 +135,14 @@ def test_directions_are_distributed_by_the_density(name):
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_bins_of_any_probabilities_give_what_the_environment_emits(name):
+def test_bins_of_any_probabilities_give_the_emission_of_the_environment(name):
     s = _samples(name)
     assert _agree(s["chance estimate"], s["estimate"])
     assert _agree(s["share estimate"], s["estimate"])
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_bins_are_sampled_by_what_they_emit(name):
+def test_bins_are_sampled_in_proportion_to_their_emission(name):
     """Chosen by their share, they make nearly the same estimate of all that is emitted; also where
     a map's own sampling misses the pole, and though the sun is smaller than a texel of the sky."""
     estimate = _samples(name)["share estimate"]
@@ -186,7 +186,7 @@ def test_samples_lie_behind_the_scene_and_lanes_without_one_are_zero(name):
 
 @pytest.mark.parametrize("name", ["turned", "sky"])
 def test_a_few_directions_stand_for_a_bin(name):
-    """Light and mean direction of each bin are those of many samples."""
+    """Light and mean direction of each bin agree with many samples."""
     bins, each = EnvironmentBins(_scene(name)), 1 << 10
     index = dr.arange(mi.UInt32, bins.count * each) // each
     numbers, ref = mi.PCG32(size=len(index)), dr.zeros(mi.Interaction3f, len(index))
@@ -196,7 +196,7 @@ def test_a_few_directions_stand_for_a_bin(name):
         value = brightness(weight)
         columns = value, value * ds.d.x, value * ds.d.y, value * ds.d.z
         found.append(np.array([dr.block_sum(x, each).numpy() for x in columns]) / each)
-    # A bin at the horizon may be black but for a few directions
+    # A bin at the horizon may be black except for a few directions
     light = found[0][0] + found[0][0].mean()
     assert (np.abs(found[1] - found[0]) <= 0.06 * light).all()
 

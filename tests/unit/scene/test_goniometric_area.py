@@ -1,4 +1,4 @@
-"""``goniometric_area``: its radiance is that of the profile, however the light is found."""
+"""``goniometric_area`` has the radiance of its profile, however a path finds the light."""
 
 from __future__ import annotations
 

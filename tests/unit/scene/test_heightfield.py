@@ -47,7 +47,7 @@ def triangle_of(number: mi.UInt32, columns: int) -> mi.UInt32:
 @pytest.mark.parametrize("kind", ["camera", "random"])
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("pose", ["identity", "turned"])
-def test_rays_hit_what_they_hit_in_a_mesh(size, pose, kind):
+def test_rays_hit_the_same_points_as_in_a_mesh(size, pose, kind):
     heights, to_world = terrain(*size), poses()[pose]
     _check_hits(heights, to_world, kind)
 
@@ -100,7 +100,7 @@ def test_rays_begin_and_end_where_they_should():
 @pytest.mark.parametrize("face_normals", [False, True])
 @pytest.mark.parametrize("flip_normals", [False, True])
 @pytest.mark.parametrize("scale", [1.0, -2.5])
-def test_surface_interactions_are_those_of_a_mesh(face_normals, flip_normals, scale):
+def test_surface_interactions_agree_with_a_mesh(face_normals, flip_normals, scale):
     heights, to_world = terrain(17, 33, 0.05), poses()["turned"]
     normals = {"face_normals": face_normals, "flip_normals": flip_normals}
     shape = heightfield(heights, to_world=to_world, scale=scale, **normals)
@@ -228,7 +228,7 @@ def test_render_agrees_with_a_mesh():
             },
         }, optimize=False)  # fmt: skip
         images.append(np.array(mi.render(scene, spp=8, seed=1)))
-    # The same paths, but for a few that rounding sends elsewhere
+    # The same paths, except for a few that rounding sends elsewhere
     difference = np.abs(images[0] - images[1])
     assert images[1].std() > 0.05
     assert np.quantile(difference, 0.99) < 1e-3 and difference.mean() < 1e-3

@@ -1,4 +1,4 @@
-"""What ``heightfield`` reads: files, bitmaps, tensors and parameters, and which it refuses."""
+"""The files, bitmaps, tensors and parameters that ``heightfield`` reads, or refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of emitters: samples have the density that was said, and give what rays find."""
+"""Cells of emitters: samples have their reported density, and bring the light that rays find."""
 
 from __future__ import annotations
 

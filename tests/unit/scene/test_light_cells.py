@@ -1,4 +1,4 @@
-"""Cells of emitters: how lights are divided, and in which cell a point is found again."""
+"""Cells of emitters: lights are divided into cells, and a point is found again in its cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The power of lights, and choosing by it: no light that emits is left out."""
+"""The power of lights, and choices by power: no light that emits is left out."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _by_rays(emitter: mi.Emitter) -> float:
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"], indirect=True)
-def test_powers_are_what_mitsuba_sends_out(variant):
+def test_powers_agree_with_the_rays_that_mitsuba_sends_out(variant):
     lights = {
         "texel": _spot(_texel(3)),
         "gradient": _spot(np.add.outer(np.arange(5.0), np.arange(9.0))),
@@ -60,7 +60,7 @@ def test_powers_are_what_mitsuba_sends_out(variant):
     assert powers == pytest.approx(expected, rel=0.05)
 
 
-def test_what_comes_from_infinity_does_not_depend_on_merged_rectangles():
+def test_light_from_infinity_does_not_depend_on_merged_rectangles():
     """Mitsuba does not know how large they are."""
     def rectangle(x: float) -> dict:
         return {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([x, 0, 0]),
@@ -75,7 +75,7 @@ def test_what_comes_from_infinity_does_not_depend_on_merged_rectangles():
     assert powers["DirectionalEmitter"] == pytest.approx(np.pi * square, rel=0.01)
 
 
-def test_lights_whose_samples_are_black_are_chosen_and_those_without_weight_are_not():
+def test_lights_with_black_samples_are_chosen_and_lights_without_weight_are_not():
     scene = floor(
         lamp=lamp(0, 0, 1), black=lamp(0.5, 0, 1, radiance=0.0),
         off={"type": "point", "position": [0, 0, 1], "sampling_weight": 0.0},

@@ -74,7 +74,7 @@ def _ply(tmp_path, **changes: Any) -> Scene:
 
 @pytest.mark.parametrize("changes", [{}, {"face_normals": True}, {"flip_normals": True}], ids=str)
 @pytest.mark.parametrize("quantized", [False, True])
-def test_image_and_output_variables_are_those_of_the_mesh(
+def test_image_and_output_variables_agree_with_the_mesh(
     tmp_path, changes: Scene, quantized: bool
 ) -> None:
     ring = _ply(tmp_path, **changes)
@@ -155,7 +155,7 @@ def test_attributes_keep_their_vertices_and_faces() -> None:
         assert_same_image(_image(stage(ring=_around(coloured(name, per)))), expected, share=0.99)
 
 
-def test_medium_in_it_is_that_of_the_mesh() -> None:
+def test_a_medium_inside_looks_as_inside_the_mesh() -> None:
     fog = {"type": "homogeneous", "sigma_t": 3.0, "albedo": 0.8}
 
     def filled() -> mi.Mesh:
@@ -176,7 +176,7 @@ def test_other_shapes_may_move_beside_it(tmp_path) -> None:
     assert_same_image(found, expected, share=0.98)
 
 
-def test_gradients_of_its_colour_are_those_of_the_mesh() -> None:
+def test_gradients_of_its_colour_agree_with_the_mesh() -> None:
     gradients = []
     for wrap in (lambda shape: shape, _around):
         scene = mi.load_dict(stage(ring=wrap(_ring(bsdf=diffuse(0.3, 0.5, 0.7)))), optimize=False)
@@ -194,7 +194,7 @@ def test_gradients_of_its_colour_are_those_of_the_mesh() -> None:
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 @pytest.mark.slow
-def test_spectral_image_is_that_of_the_mesh(variant: str) -> None:
+def test_spectral_image_agrees_with_the_mesh(variant: str) -> None:
     expected, found = (
         _image(stage(ring=wrap(_ring(bsdf=diffuse(0.3, 0.5, 0.7)))), aovs=AOVS)
         for wrap in (lambda shape: shape, _around)
@@ -242,7 +242,7 @@ def test_integrators_that_do_not_see_it_are_refused() -> None:
         ({"a": {"type": "cube"}, "quantized": 1}, '"quantized" is 1; it must be of type bool'),
     ],
 )  # fmt: skip
-def test_what_it_cannot_hold_is_refused(nested: Scene, message: str) -> None:
+def test_meshes_that_it_cannot_hold_are_refused(nested: Scene, message: str) -> None:
     with pytest.raises(Exception, match=message):
         mi.load_dict({"type": "lightweight_mesh", **nested})
 

@@ -162,7 +162,7 @@ def test_splits_follow_walls_among_small_things() -> None:
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_rays_hit_what_they_hit_in_mitsuba(count: int) -> None:
+def test_rays_hit_the_same_points_as_in_mitsuba(count: int) -> None:
     vertices, faces = _soup(count)
     geometry = MeshGeometry(mesh(vertices, faces))
     scene = mi.load_dict({"type": "scene", "mesh": mesh(vertices, faces)}, optimize=False)
@@ -210,13 +210,13 @@ def test_no_ray_leaves_closed_mesh_through_edge_or_corner(
     assert geometry.occluded(_rays(o, target - o), mi.Bool(True)).numpy().all()
 
 
-def test_memory_is_that_of_the_manual() -> None:
+def test_memory_agrees_with_the_manual() -> None:
     vertices, faces = _ball(60)
     assert MeshGeometry(mesh(vertices, faces)).nbytes / len(faces) < 3.4
     assert PackedMesh(mesh(vertices, faces)).nbytes / len(faces) < 12.5
 
 
-def test_equal_and_degenerate_triangles_are_no_trouble() -> None:
+def test_equal_and_degenerate_triangles_are_accepted() -> None:
     vertices, faces = _soup(3)
     vertices[3:6] = vertices[3]  # a point
     vertices[6:9] = vertices[6] + np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0]])  # a line

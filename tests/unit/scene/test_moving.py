@@ -76,7 +76,7 @@ def resting_scene(case: str, time: float) -> mi.Scene:
 
 @functools.cache
 def reference(case: str) -> np.ndarray:
-    """Of ``path``: the average over 64 times, in the middle of strata."""
+    """Images of ``path``, averaged over 64 times in the middle of strata."""
     (begin, end), *_ = CASES[case]
     images = []
     for i in range(64):
@@ -114,8 +114,8 @@ def test_integrators_that_nest_ours_see_motion() -> None:
     assert_same_image(images[0][..., :3], images[1])
 
 
-def test_blur_is_not_what_is_seen_at_one_time() -> None:
-    """Otherwise the tests of the mean would have no effect."""
+def test_blur_differs_from_the_view_at_any_single_time() -> None:
+    """If it did not, the tests of the mean would prove nothing."""
     case = "turns_more_than_once"
     image = batches(resting_scene(case, 0.5), REFERENCE.make(4), 256, [1])[0]
     assert np.abs(image - reference(case).mean(axis=0)).mean() > 0.05 * image.mean()
@@ -160,7 +160,7 @@ def test_moving_things_do_not_shadow_themselves(distance: float) -> None:
 FIELDS = ("t", "time", "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv", "wi", "prim_index")
 
 
-def test_interactions_are_those_of_things_at_the_pose() -> None:
+def test_interactions_agree_with_objects_at_the_pose() -> None:
     parameters, pose = keys()
     time = 0.55
 
@@ -229,7 +229,7 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("make", [lambda: SPIN, lambda: SLIDE, keys], ids=["spin", "slide", "keys"])
-def test_poses_are_those_computed_by_hand(make: Callable) -> None:
+def test_poses_agree_with_poses_computed_by_hand(make: Callable) -> None:
     parameters, pose = make()
     shape = mi.load_dict({"type": "moving", **parameters, "cube": {"type": "cube"}})
     points = np.random.default_rng(2).normal(size=(5, 3))

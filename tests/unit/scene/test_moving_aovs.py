@@ -1,4 +1,4 @@
-"""Output variables of what moves are those of the time of each ray."""
+"""Output variables show moving objects at the time of each ray."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _still_room(time: float) -> Scene:
     "variant", ["llvm_ad_rgb", pytest.param("llvm_ad_spectral", marks=pytest.mark.slow)],
     indirect=True,
 )  # fmt: skip
-def test_closed_shutter_shows_those_of_its_time(variant: str) -> None:
+def test_a_closed_shutter_shows_the_output_variables_of_its_time(variant: str) -> None:
     moving, still = (_image(scene, AOVS, 1) for scene in (_moving_room(0.55, 0.55),
                                                           _still_room(0.55)))  # fmt: skip
     assert moving.shape == still.shape

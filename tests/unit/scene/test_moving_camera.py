@@ -1,4 +1,4 @@
-"""Moving cameras: each ray is that of the camera at rest at the pose of the ray's time."""
+"""Moving cameras: each ray agrees with a camera that rests at the pose of the ray's time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _placed(pose: np.ndarray, begin: float = 0.0, end: float = 0.0, **changes: A
 
 
 @pytest.mark.parametrize("plugin", SENSORS)
-def test_rays_are_those_of_the_camera_at_the_pose(plugin: str) -> None:
+def test_rays_agree_with_the_camera_at_the_pose(plugin: str) -> None:
     parameters, pose = keys()
     sensor = mi.load_dict(_moved(parameters, plugin=plugin, **SENSORS[plugin]))
     rng = np.random.default_rng(1)
@@ -85,7 +85,7 @@ def test_rays_are_those_of_the_camera_at_the_pose(plugin: str) -> None:
 
 
 @pytest.mark.parametrize("plugin", ["perspective", "thinlens"])
-def test_connections_are_those_to_the_camera_at_the_pose(plugin: str) -> None:
+def test_connections_lead_to_the_camera_at_the_pose(plugin: str) -> None:
     parameters, pose = keys()
     sensor = mi.load_dict(_moved(parameters, plugin=plugin, **SENSORS[plugin]))
     rng = np.random.default_rng(1)
@@ -139,13 +139,14 @@ def _view(case: str) -> tuple[tuple[Scene, Pose], Scene, tuple[float, float]]:
 
 
 def _things() -> Scene:
-    """No caustics: not all techniques of light paths find those of the ball in the mirror."""
+    """No caustics: not all techniques of light paths find the caustics of the ball in the
+    mirror."""
     return {**pair(np.eye(4)), "mirror": rectangle(mi.ScalarTransform4f().translate([0, 0, -9]))}
 
 
 @functools.cache
 def reference(case: str) -> np.ndarray:
-    """Of ``path`` with cameras at rest: the average over 64 times, in the middle of strata."""
+    """Images of ``path`` with cameras at rest, averaged over 64 times in the middle of strata."""
     (_parameters, pose), changes, (begin, end) = _view(case)
     scenes = (
         mi.load_dict(room(_placed(pose(begin + (end - begin) * (i + 0.5) / 64), **changes),
@@ -204,7 +205,7 @@ def _integrator(name: str) -> mi.Integrator:
     return makers[name]() if name in makers else TECHNIQUES[name].make(4)
 
 
-def test_a_camera_that_turns_sees_what_it_sees_of_a_world_that_turns_back() -> None:
+def test_a_turning_camera_sees_the_image_of_a_world_that_turns_the_other_way() -> None:
     """Ray by ray: a motion of the camera is the inverse motion of all things."""
     T = mi.ScalarTransform4f
     turn = {"axis": [0.2, 0.1, 1], "center": [0.1, -1, 0.3], "begin": 0.2, "end": 0.9}
@@ -294,7 +295,7 @@ def test_parameters_of_the_camera_can_be_changed() -> None:
         ({"a": {"type": "perspective"}, "scale": 3.0}, "scale"),
     ],
 )
-def test_what_cannot_move_is_refused(nested: Scene, message: str) -> None:
+def test_objects_that_cannot_move_are_refused(nested: Scene, message: str) -> None:
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.load_dict({"type": "moving_camera", "translate": [1, 0, 0], **nested})
 

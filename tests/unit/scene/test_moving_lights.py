@@ -94,7 +94,7 @@ def _other() -> Scene:
 
 def _room(shutter: tuple[float, float], light: Scene, **things: Any) -> mi.Scene:
     things = {"lamp": _other(), **pair(np.eye(4)), **things, "moving_lamp": light}
-    # The order of lights is that of the dictionary
+    # The lights are in the order of the dictionary
     return mi.load_dict(room(camera(*shutter), **things), optimize=False)
 
 
@@ -133,8 +133,8 @@ def test_closed_shutter_in_variant(variant: str) -> None:
     *(pytest.param(name, marks=pytest.mark.slow) for name in AREAS
       if name not in ("sphere", "disk")),
 ])  # fmt: skip
-def test_densities_are_those_of_the_light_at_the_pose(light: str) -> None:
-    """Of connections, and of rays that run into the light there."""
+def test_densities_agree_with_the_light_at_the_pose(light: str) -> None:
+    """The densities of connections, and of rays that hit the light there."""
     parameters, pose = keys()
     moving = mi.load_dict({"type": "scene", "lamp": _moving(light, parameters)})
     emitter = moving.emitters()[0]
@@ -175,7 +175,7 @@ def test_densities_are_those_of_the_light_at_the_pose(light: str) -> None:
 
 @functools.cache
 def reference(light: str) -> np.ndarray:
-    """Of ``path``: the average over 64 times, in the middle of strata."""
+    """Images of ``path``, averaged over 64 times in the middle of strata."""
     images = [
         batches(_room((0.0, 0.0), _resting(light, SPIN[1]((i + 0.5) / 64)), sky=sky()),
                 REFERENCE.make(3), 64, [seed + i for seed in (1001, 2001)])
@@ -269,7 +269,7 @@ XML = """<scene version="3.0.0">
 
 
 @pytest.mark.parametrize("light", POINTS)
-def test_bounds_are_those_of_the_motion(light: str) -> None:
+def test_bounds_enclose_the_motion(light: str) -> None:
     box = mi.load_dict(_moving(light, {"translate": [1, 0, -1]})).bbox()
     expected = [-0.6, -0.8, 0.7, 0.4, -0.8, 1.7]
     np.testing.assert_allclose([*box.min, *box.max], expected, atol=1e-5)
@@ -303,13 +303,13 @@ def test_lights_of_a_file(tmp_path) -> None:
         ({"a": {"type": "point"}, "intensity": 3.0}, "intensity"),
     ],
 )  # fmt: skip
-def test_what_cannot_move_is_refused(nested: Scene, message: str) -> None:
+def test_objects_that_cannot_move_are_refused(nested: Scene, message: str) -> None:
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.load_dict({"type": "moving_light", "translate": [1, 0, 0], **nested})
 
 
 @pytest.mark.parametrize("light", ["sphere", "point"])
-def test_light_paths_from_what_moves_are_refused(light: str) -> None:
+def test_light_paths_from_moving_lights_are_refused(light: str) -> None:
     scene = _room((0.0, 1.0), _moving(light, SPIN[0]))
     for integrator in (
         {"type": "bdpt"}, {"type": "light_tracer"}, {"type": "mlt"},

@@ -1,4 +1,4 @@
-"""What ``moving`` shapes make of their parameters, and what they refuse."""
+"""The parameters of ``moving`` shapes: their meaning, and their errors."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _coloured_mesh() -> mi.Mesh:
     "not_a_number", "mixed", "gap", "one_pose", "order", "scale", "mirror", "nothing", "material",
     "lights", "sensor", "nested", "attribute",
 ])  # fmt: skip
-def test_what_cannot_move_is_refused(case: str) -> None:
+def test_objects_that_cannot_move_are_refused(case: str) -> None:
     parameters, message = _errors()[case]
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.load_dict({"type": "moving", **parameters})
@@ -145,7 +145,7 @@ def test_instance_needs_its_group() -> None:
         scene_query(scene)
 
 
-def test_what_does_not_see_motion_is_refused() -> None:
+def test_integrators_that_do_not_see_motion_are_refused() -> None:
     moving = {"type": "moving", "translate": [1, 0, 0], "cube": {"type": "cube"}}
     scene = mi.load_dict({"type": "scene", "moving": moving, "sensor": sensor(film=film(4, 4))})
     variance = mi.load_dict({"type": "variance", "nested": {"type": "path"}})
@@ -177,7 +177,7 @@ def test_the_box_of_moving_shapes_holds_merged_ones():
                                [list(apart.min), list(apart.max)], atol=1e-5)  # fmt: skip
 
 
-def test_a_group_without_an_instance_is_nothing_that_moves():
+def test_a_group_without_an_instance_does_not_move():
     group = {"type": "shapegroup", "id": "g", "a": {"type": "sphere", "center": [0, 0, 50]}}
     moving = {"type": "moving", "translate": [1, 0, 0], "group": group}
     with pytest.raises(Exception, match="nothing is nested"):

@@ -131,7 +131,7 @@ def test_closed_shutter_shows_all_at_its_time(time: float, hide: bool) -> None:
 AOVS = "z:depth,p:position,n:sh_normal,g:geo_normal,i:prim_index,uv:uv,a:albedo"
 
 
-def test_output_variables_are_those_of_the_time() -> None:
+def test_output_variables_show_the_scene_at_the_time_of_the_ray() -> None:
     changes = {**LENS, "film": film(40, 30)}
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 1, "aovs": AOVS})
     one, other = (
@@ -144,7 +144,7 @@ def test_output_variables_are_those_of_the_time() -> None:
 
 @functools.cache
 def _reference(lights: bool) -> np.ndarray:
-    """Of scenes at rest: the average over 64 times, in the middle of strata."""
+    """Images of scenes at rest, averaged over 64 times in the middle of strata."""
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     images = []
     for i in range(64):

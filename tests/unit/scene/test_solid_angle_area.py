@@ -1,4 +1,4 @@
-"""Images with ``solid_angle_area`` have the mean of those with ``area``; its parameters, and its
+"""Images with ``solid_angle_area`` have the mean of images with ``area``; its parameters, and its
 errors."""
 
 from __future__ import annotations

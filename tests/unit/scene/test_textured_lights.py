@@ -1,4 +1,4 @@
-"""Large lights with a texture: divided where their cells are about even, whole otherwise."""
+"""Large lights with a texture are divided where their cells are about even, and whole otherwise."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_texture_with_spots_is_sampled_by_mitsuba(surface: dict):
     assert LightCells(_scene(surface), None).count == 1, "what is not divided samples its texture"
 
 
-def test_cells_of_a_gradient_bring_what_rays_find(surface: dict):
+def test_cells_of_a_gradient_bring_the_light_that_rays_find(surface: dict):
     scene = _scene(surface)
     cells = LightCells(scene, mi.Vector3f(1.0))
     assert cells.count >= 20 and cells.share.sum() == pytest.approx(1)
@@ -82,7 +82,7 @@ def test_cells_of_a_gradient_bring_what_rays_find(surface: dict):
     assert np.median(np.abs((density / ds.pdf).numpy() - 1)) < 1e-4
 
 
-def test_divided_textures_do_not_mind_shapes_and_emitters_that_cannot_be_sampled(tmp_path):
+def test_divided_textures_work_beside_shapes_and_emitters_that_cannot_be_sampled(tmp_path):
     """Neither in their scene nor in another one: Dr.Jit asks all that exist."""
     T = mi.ScalarTransform4f
     (tmp_path / "curve.txt").write_text("-1 0 0.3 0.1\n0 0 0.4 0.1\n0.3 0 0.3 0.1\n1 0 0.5 0.1\n")
@@ -117,7 +117,7 @@ def test_divided_textures_do_not_mind_shapes_and_emitters_that_cannot_be_sampled
 @pytest.mark.parametrize(
     "surface", ["rectangle", pytest.param("mesh", marks=pytest.mark.slow)], indirect=True
 )
-def test_the_mean_is_that_of_path(surface: dict):
+def test_the_mean_agrees_with_path(surface: dict):
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
     scene = _scene(

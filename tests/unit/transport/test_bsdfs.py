@@ -1,4 +1,4 @@
-"""What BSDFs return is finite, also where Mitsuba's is not."""
+"""BSDFs return finite values, even where Mitsuba's do not."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def assert_agree(a: np.ndarray, b: np.ndarray, precision: float) -> None:
 
 
 @pytest.mark.parametrize("glass, wrapper", CASES)
-def test_one_wavelength_is_that_of_path_with_its_index(variant: str, glass, wrapper) -> None:
+def test_one_wavelength_agrees_with_path_at_its_index(variant: str, glass, wrapper) -> None:
     λ = 430.0
 
     def with_walk(sampler):
@@ -292,7 +292,7 @@ def test_refraction_leaves_one_wavelength_and_reflection_four(variant: str) -> N
 
 
 def test_connections_through_glass_are_the_heros(variant: str) -> None:
-    """As samples of the BSDF are: MIS weights would not add up otherwise."""
+    """Samples of the BSDF are too: otherwise MIS weights would not add up."""
     scene = furnace(ROUGH)
     heroes = Heroes(scene)
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
@@ -315,7 +315,7 @@ def test_nothing_is_left_in_the_kernel_where_nothing_disperses(variant: str) -> 
     assert heroes.scatter((), value, None, None, None) == (value, 1.0, ())
 
 
-def test_what_disperses_is_found_also_inside_other_things(variant: str) -> None:
+def test_dispersive_bsdfs_are_found_inside_other_bsdfs(variant: str) -> None:
     class Mover:
         children = (mi.load_dict({"type": "sphere", "bsdf": wrapped("mask", ROUGH)}),)
 

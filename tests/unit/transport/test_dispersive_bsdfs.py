@@ -47,7 +47,7 @@ def interaction(rng: np.random.Generator) -> mi.SurfaceInteraction3f:
 
 
 def fresnel(cos_i: np.ndarray, η: np.ndarray) -> np.ndarray:
-    """Unpolarised reflectance, in double precision; ``η`` is that of the other side."""
+    """Unpolarised reflectance in double precision; ``η`` is the index of the other side."""
     cos_t = np.sqrt(np.maximum(0, 1 - (1 - cos_i**2) / η**2))
     s = (cos_i - η * cos_t) / (cos_i + η * cos_t)
     p = (η * cos_i - cos_t) / (η * cos_i + cos_t)
@@ -108,7 +108,7 @@ def test_corner_cases_are_finite(variant: str, plugin: str) -> None:
     "ours, theirs, extra",
     [(SMOOTH, "dielectric", {}), *((ROUGH, "roughdielectric", kind) for kind in ROUGH_KINDS)],
 )
-def test_constant_index_is_that_of_mitsuba(variant: str, ours: str, theirs: str, extra) -> None:
+def test_constant_index_agrees_with_mitsuba(variant: str, ours: str, theirs: str, extra) -> None:
     rng = np.random.default_rng(2)
     si, wo = interaction(rng), directions(rng)
     u, v = mi.Float(rng.uniform(size=COUNT)), mi.Point2f(rng.uniform(size=(2, COUNT)))
@@ -150,7 +150,7 @@ def test_weight_of_a_sample_is_its_value_over_its_density(variant: str, kind) ->
 @pytest.mark.parametrize("visible", [True, False])
 @pytest.mark.parametrize("wi", [(0.4, 0.2, 0.8), (-0.6, 0.3, -0.7)], ids=["outside", "inside"])
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
-def test_density_is_that_of_the_samples(variant: str, distribution: str, wi, visible) -> None:
+def test_density_agrees_with_the_samples(variant: str, distribution: str, wi, visible) -> None:
     sample, pdf = mi.chi2.BSDFAdapter(
         ROUGH,
         {"type": ROUGH, "int_ior": "sf10", "distribution": distribution, "alpha_u": 0.2,

@@ -1,4 +1,4 @@
-"""Recorded kernels: the same images without tracing, and nothing stale."""
+"""Recorded kernels render the same images without tracing, and never use stale data."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _assert_same(image: np.ndarray, other: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_images_are_those_of_traced_kernels(name: str) -> None:
+def test_images_agree_with_traced_kernels(name: str) -> None:
     parameters = {"type": name, "max_depth": 4, **_CHAINS.get(name, {})}
     scene, integrator = _scene(), mi.load_dict(parameters)
     for seed in (1, 2):
@@ -96,7 +96,7 @@ def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, rend
 
 
 @pytest.mark.parametrize("name", ["auto_path", "bdpt", "pssmlt"])
-def test_images_by_a_thin_lens_are_those_of_traced_kernels(name: str) -> None:
+def test_images_of_a_thin_lens_agree_with_traced_kernels(name: str) -> None:
     """Light paths and chains use the sensor, and are not recorded."""
     parameters = {"type": name, "max_depth": 4, **_CHAINS.get(name, {})}
     scene, integrator = _scene(camera=sensor(**_THIN_LENS)), mi.load_dict(parameters)
@@ -116,7 +116,7 @@ def test_gradients_are_refused_before_anything_is_learned(camera: dict) -> None:
 
 
 def test_a_trial_of_light_paths_is_recorded() -> None:
-    """It finds the same: what its observer remembers of a pass is that of this pass."""
+    """The trial finds the same: its observer remembers the values of the pass that is observed."""
     scene = _scene(ball={"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}})
     integrator = mi.load_dict({"type": "vcm", "max_depth": 4, "light_paths": "auto"})
 
@@ -134,7 +134,7 @@ def test_a_trial_of_light_paths_is_recorded() -> None:
 
 
 def test_light_paths_with_learned_lights_begin_once(monkeypatch) -> None:
-    """Also where some lights are points, whose probabilities only light paths ask for."""
+    """This includes scenes with point lights, whose probabilities only light paths need."""
     jobs, start = [], Job.run
     monkeypatch.setattr(Job, "run", lambda job, *more: jobs.append(job) or start(job, *more))
     intensity = {"type": "rgb", "value": 2.0}
@@ -231,7 +231,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("name", ["composed_path", "bdpt"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_changes_in_a_scene_is_seen(change: str, name: str) -> None:
+def test_changes_of_a_scene_are_seen(change: str, name: str) -> None:
     squares = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([4, 4, 1])}
     scene = _scene(
         glass={"type": "sphere", "center": [-0.8, -0.6, 0.4], "radius": 0.4,
@@ -279,8 +279,8 @@ def test_parameters_of_the_integrator_are_seen() -> None:
         _assert_same(_image(scene, integrator), _traced(scene, integrator))
 
 
-def test_what_was_learned_is_that_of_the_render() -> None:
-    """Tables of another size, and of other contents, by the same kernels."""
+def test_frozen_kernels_read_the_tables_that_the_render_learned() -> None:
+    """The tables have other sizes and other contents, and the kernels are the same."""
     scene = _scene()
     for spp, seed in ((16, 1), (16, 2), (64, 3), (16, 1)):
         integrator = mi.load_dict({"type": "neepp", "max_depth": 4, "grid": 4})
@@ -290,7 +290,7 @@ def test_what_was_learned_is_that_of_the_render() -> None:
 
 
 def test_the_number_of_threads_is_seen() -> None:
-    """Kernels that add from several threads have room for so many."""
+    """Kernels that add from several threads have memory for the current number of threads."""
     scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
     expected, count = _traced(scene, integrator), dr.thread_count()
     try:
@@ -308,8 +308,8 @@ def _lit_by_a_plugin() -> mi.Scene:
 
 
 def test_plugins_in_python_are_traced_each_time() -> None:
-    """Also those of scenes that nobody renders: Dr.Jit traces all of a kind. What they free while a
-    kernel is recorded would end the process."""
+    """Plugins of other scenes too, because Dr.Jit traces all plugins of a kind. If a plugin freed
+    memory while a kernel is recorded, the process would end."""
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
     other = _lit_by_a_plugin()
     for scene in (other, _scene()):
@@ -344,7 +344,7 @@ class _CopyingWalk(Walk):
 
 
 @pytest.mark.parametrize("kind", [_ReadingWalk, _CopyingWalk])
-def test_what_cannot_be_recorded_is_rendered_all_the_same(kind: type[Walk]) -> None:
+def test_walks_that_cannot_be_recorded_render_the_same_image(kind: type[Walk]) -> None:
     scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
     expected = 2 * _traced(scene, integrator)
     integrator.walk = lambda **decisions: kind(3, 5, **decisions)

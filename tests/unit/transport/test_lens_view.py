@@ -49,7 +49,7 @@ def a_ray(view: LensView, aperture: mi.Point2f | float = 0.5) -> mi.Ray3f:
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-def test_depths_are_those_along_the_axis_from_any_point_of_the_lens(scale):
+def test_depths_are_measured_along_the_axis_from_any_point_of_the_lens(scale):
     view = a_view(a_scene(scale))
     for aperture in (0.5, mi.Point2f(0.9, 0.2)):
         _p, inverse_depth = view.meet(a_ray(view, aperture))

@@ -57,7 +57,7 @@ def _looking_along_z(**other) -> dict:
 
 @pytest.mark.parametrize("sigma_t", [[0.1, 0.4, 1.5], 1.0], ids=["chromatic", "grey"])
 def test_absorbing_medium_attenuates_as_beer_and_lambert_say(sigma_t) -> None:
-    """Of a sky of radiance 1, exp(−σ_t d) arrives."""
+    """From a sky of radiance 1, exp(−σ_t d) arrives."""
     medium = homogeneous(sigma_t, albedo=0.0)
     scene = mi.load_dict({"type": "scene", "sensor": _looking_along_z(), "fog": cube(medium),
                           "sky": {"type": "constant"}})  # fmt: skip
@@ -90,7 +90,7 @@ def test_shadow_rays_are_attenuated_by_absorbing_media(name: str) -> None:
     left, right = images[:, :, :4].mean(axis=(1, 2, 3)), images[:, :, 4:].mean(axis=(1, 2, 3))
     expected = np.exp([-1.4, -1.4] if name == "homogeneous" else [-1.4, -0.6])
     for values, exact in zip((left, right), expected):
-        # Homogeneous media leave no noise, but for where rays begin
+        # Homogeneous media leave no noise, except for the starts of rays
         z, error = z_exact(values, exact, allowance=1e-4)
         assert abs(z) < 4 and error < 0.005
 
@@ -125,7 +125,7 @@ def test_white_medium_in_a_white_world_is_invisible(name: str, light: str) -> No
 
 class _OrderOfVolpath(DirectionSamples):
     """The compiler of Mitsuba's wheels evaluates arguments from the right to the left: ``volpath``
-    draws the numbers of a direction before that of a lobe."""
+    draws the numbers of a direction before the number of a lobe."""
 
     def draw(self, state, sampler, vertex, active):
         sample_2 = sampler.next_2d()

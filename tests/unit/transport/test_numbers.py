@@ -134,9 +134,9 @@ def _recorded(name: str, **more: Any) -> tuple[Any, _Recorder, CameraRays, dict[
 
 
 @pytest.mark.parametrize("name", _NAMES)
-def test_a_bounce_draws_as_many_numbers_whatever_happens(name: str) -> None:
-    """Also where a connection is rejected, where nothing can be connected, and in the dark: a
-    number then means the same after a small change of those before it."""
+def test_a_bounce_always_draws_the_same_number_of_numbers(name: str) -> None:
+    """This includes rejected connections, vertices that cannot be connected, and the dark: each
+    number keeps its meaning after a small change of the numbers before it."""
     watched = _Watched()
     _recorded(name, directions=watched, roulette=_NeverEnds())
     drawn = watched.drawn.numpy().reshape(DEPTH, LANES).astype(np.int64)

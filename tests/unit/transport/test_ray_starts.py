@@ -32,7 +32,7 @@ def _height(ray: mi.Ray3f) -> float:
 
 
 @pytest.mark.parametrize("factor", [1, 0.5, 1e4])
-def test_rays_are_those_of_mitsuba_in_scenes_that_are_not_small(factor):
+def test_rays_agree_with_mitsuba_in_scenes_that_are_not_small(factor):
     assert scene_query(_scaled(factor)).starts == RayStarts()
     si, target = _interaction(), mi.Point3f(1e-3, 3e-3, 5e-3)
     starts = RayStarts()
@@ -41,7 +41,7 @@ def test_rays_are_those_of_mitsuba_in_scenes_that_are_not_small(factor):
     assert dr.all(starts.along(si, mi.Vector3f(0, 0, 1)).o == si.spawn_ray(mi.Vector3f(0, 0, 1)).o)
 
 
-def test_rays_of_a_small_scene_start_as_close_as_those_of_its_enlarged_copy():
+def test_rays_of_a_small_scene_start_as_close_as_rays_of_its_enlarged_copy():
     starts = scene_query(_scaled(1e-3)).starts
     assert starts.unit == pytest.approx(4e-3)  # up to the camera
     si, up = _interaction(), mi.Vector3f(0, 0, 1)
@@ -55,7 +55,7 @@ def test_rays_of_a_small_scene_start_as_close_as_those_of_its_enlarged_copy():
 
 
 @pytest.mark.parametrize("far", ["camera", "spot"])
-def test_what_is_seen_or_lit_from_afar_keeps_mitsubas_offset(far):
+def test_objects_seen_or_lit_from_afar_keep_mitsubas_offset(far):
     """Its points are rounded too much."""
     view = lookat([0, -4, 1.2], [0, 0, 0], [0, 0, 1])
     changes = {"camera": sensor(to_world=view)} if far == "camera" else {
@@ -105,7 +105,7 @@ def test_small_things_in_a_thin_coat_are_as_bright_as_their_enlarged_copy(name, 
     assert mean(1, "path") < 0.95 * mean(100, "path")
 
 
-def test_offsets_are_those_of_mitsuba_where_no_ray_would_skip_a_surface() -> None:
+def test_offsets_agree_with_mitsuba_where_no_ray_would_skip_a_surface() -> None:
     exact = RayStarts(1.0, exact=True)
     mask = {"type": "mask", "opacity": 0.5, "bsdf": diffuse()}
     assert ray_starts(_coated()) == ray_starts(_coated(coat=mask)) == exact
@@ -114,7 +114,7 @@ def test_offsets_are_those_of_mitsuba_where_no_ray_would_skip_a_surface() -> Non
     assert ray_starts(_coated(100)) == RayStarts()
 
 
-def test_offsets_are_those_of_mitsuba_where_intersections_are_less_exact() -> None:
+def test_offsets_agree_with_mitsuba_where_intersections_are_less_exact() -> None:
     """Intersections with a cylinder are rounded by the square of the distance."""
     T = mi.ScalarTransform4f
     pipe = {"type": "cylinder", "to_world": T().translate([0.5, 0, 0]).scale(1e-2)}
@@ -124,7 +124,7 @@ def test_offsets_are_those_of_mitsuba_where_intersections_are_less_exact() -> No
 
 
 @pytest.mark.parametrize("kind", ["sphere", "disk", "cube", "rectangle"])
-def test_offsets_that_follow_rounding_errors_are_large_enough(kind: str) -> None:
+def test_offsets_computed_from_rounding_errors_are_large_enough(kind: str) -> None:
     """Rays that leave a surface do not hit it again, and rays to one do not hit it: for things of
     any size, at a thousand sizes from the origin, seen from up to a hundred sizes."""
     T, count = mi.ScalarTransform4f, 1 << 16

@@ -24,8 +24,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 class UniformMixture(Scattering):
     """A share of the directions is uniform on the sphere, wherever a BSDF has a lobe that is not
-    discrete. One-sample MIS: the density is that of the mixture. Discrete lobes are left to the
-    BSDF."""
+    discrete. One-sample MIS: the density is the density of the mixture. Discrete lobes are left to
+    the BSDF."""
 
     def __init__(self, share: float) -> None:
         self._share = dr.opaque(mi.Float, share)

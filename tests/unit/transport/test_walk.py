@@ -250,7 +250,7 @@ print(size(always), size(always, point), size(always, area), size(always, area, 
 """
 
 
-def test_what_the_scene_lacks_is_not_in_the_kernel():
+def test_kernels_contain_no_features_that_the_scene_lacks():
     """In its own process, because Dr.Jit compiles methods of the objects of all living scenes."""
     output = subprocess.run(
         [sys.executable, "-c", KERNEL_SIZE], capture_output=True, text=True, check=True
@@ -276,7 +276,7 @@ def test_no_scene_is_freed_while_calls_are_traced(box):
 
 
 @pytest.mark.usefixtures("variant")
-def test_what_lies_behind_a_hidden_emitter_is_seen_undistorted():
+def test_objects_behind_a_hidden_emitter_are_seen_undistorted():
     """Mitsuba 3.9.1 itself is wrong here: its ``path`` measures the distance to an analytic shape
     behind the emitter from the camera, and renders it black."""
     T = mi.ScalarTransform4f
@@ -338,7 +338,7 @@ def _image(scene: mi.Scene, **integrator) -> np.ndarray:
     ],
     ids=lambda integrator: "-".join(integrator.values()),
 )  # fmt: skip
-def test_light_on_a_mask_before_nothing_is_seen_and_alpha_is_that_of_path(integrator) -> None:
+def test_light_on_a_mask_before_nothing_is_seen_and_alpha_agrees_with_path(integrator) -> None:
     """Mitsuba's ``path`` loses the light of paths that only passed through null surfaces."""
     right = 0.4 * _image(_masks(0, opacity=1.0), type="path", max_depth=2)[..., :3].mean()
     image = _image(_masks(0), **integrator, max_depth=2)

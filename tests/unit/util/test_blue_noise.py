@@ -24,13 +24,13 @@ def _made(count: int, width: int, **parameters: Any) -> mi.Sampler:
 
 
 def _points(sampler: mi.Sampler, width: int, pairs: int) -> np.ndarray:
-    """Of a seeded sampler: [y, x, sample, dimension]."""
+    """The points of a seeded sampler: [y, x, sample, dimension]."""
     drawn = np.concatenate([np.array(sampler.next_2d()).T for _ in range(pairs)], axis=1)
     return drawn.reshape(-1, width, sampler.sample_count(), 2 * pairs)
 
 
 def _is_net(points: np.ndarray) -> bool:
-    """Is there one of 2^m points in each cell of the square, for all cells of area 2^-m?"""
+    """Whether each cell of area 2^-m of the square holds one of 2^m points."""
     x, y = points.reshape(-1, points.shape[-1])[:, :2].T
     m = len(x).bit_length() - 1
     grids = [(2**k, 2 ** (m - k)) for k in range(m + 1)]
@@ -195,7 +195,7 @@ def test_passes_go_on_with_one_sequence() -> None:
     np.testing.assert_array_equal(np.concatenate(passes, axis=2), _points(whole, 5, 3))
 
 
-def test_a_clone_goes_on_and_a_fork_begins() -> None:
+def test_a_clone_continues_and_a_fork_starts_again() -> None:
     sampler = _made(4, 0)
     sampler.set_film(3)
     sampler.seed(3, 4 * 6)

@@ -27,7 +27,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
     assert [f.name for f in tmp_path.iterdir()] == ["a.exr"] and file.read_text() == "one"
 
 
-def test_what_killed_processes_have_left_is_removed(tmp_path):
+def test_files_left_by_killed_processes_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     file = tmp_path / "a.exr"
@@ -43,7 +43,7 @@ def test_what_killed_processes_have_left_is_removed(tmp_path):
     assert {f.name for f in tmp_path.iterdir()} == {"a.exr", names[1], *others}
 
 
-def test_a_link_is_replaced_and_not_what_it_leads_to(tmp_path):
+def test_a_link_is_replaced_and_its_target_is_not(tmp_path):
     mine, link = tmp_path / "mine.txt", tmp_path / "a.exr"
     mine.write_text("my text")
     link.symlink_to(mine)
@@ -61,7 +61,7 @@ def test_an_error_names_the_file(tmp_path):
 
 
 def test_a_small_archive_does_not_fill_the_memory(tmp_path):
-    """Of 64 KiB: an array is read only if it has the shape that is expected."""
+    """The archive has 64 KiB: an array is read only if it has the expected shape."""
     file = tmp_path / "a.npz"
     archives.write(file, "something 1", {"counts": np.zeros(1 << 26, np.uint8)})
     assert file.stat().st_size < 1 << 17
@@ -94,7 +94,7 @@ def test_a_pipe_and_an_endless_file_are_not_read(tmp_path):
     lambda lock, mine: os.mkfifo(lock), lambda lock, mine: lock.mkdir(),
     lambda lock, mine: lock.write_text("my text"),
 ])  # fmt: skip
-def test_what_is_no_lock_is_left_alone(tmp_path, make):
+def test_files_that_are_not_locks_are_left_alone(tmp_path, make):
     mine, folder = tmp_path / "mine.txt", tmp_path / "kept"
     mine.write_text("my text")
     folder.mkdir()
@@ -106,7 +106,7 @@ def test_what_is_no_lock_is_left_alone(tmp_path, make):
 
 
 def test_only_marks_are_removed(tmp_path):
-    """Of a comparison: other files of these suffixes are somebody's."""
+    """Marks belong to a comparison; other files with these suffixes belong to somebody else."""
     mark = marks.mark_of(tmp_path / "scene", "path")
     others = [tmp_path / "mine" / "job.running", tmp_path / "mine" / "job.crashed"]
     for file in (mark, mark.with_suffix(".crashed"), *others):

@@ -1,4 +1,4 @@
-"""Point patterns, and their weights: known cells, sums, symmetries, and what is unbiased."""
+"""Point patterns and their weights: known cells, sums, symmetries, and unbiased estimates."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_degenerate_points_have_weights(name, boundary):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("size", [1e-6, 1e-9, 1e-10, 1e-11])
-def test_a_heap_of_points_takes_nothing_from_the_others(size, dimension):
+def test_a_heap_of_points_does_not_starve_the_other_points(size, dimension):
     rng = np.random.default_rng(0)
     others, middle = rng.random((50, dimension)), np.full((1, dimension), 0.5)
     heap = np.concatenate([others, middle + size * rng.random((50, dimension))])
@@ -257,7 +257,7 @@ def test_a_shift_makes_any_weights_that_add_up_to_one_unbiased(pattern):
 
 
 def test_weights_of_piecewise_constant_densities_are_unbiased() -> None:
-    """Also where most sets leave a piece without a point."""
+    """This includes densities with a piece that most sets leave without a point."""
     edges, probabilities = [0, 0.1, 0.5, 1], [0.05, 0.6, 0.35]
     sums = []
     for u in _sets(6, 1, 3000)[..., 0]:
@@ -326,14 +326,14 @@ def test_patterns_are_uniform_on_average_reproducible_and_in_the_cube(pattern, d
     assert sets.min() >= 0 and np.float32(sets.max()) < 1
     for axis, limit in itertools.product(range(dimension), (0.2, 0.5, 0.9)):
         share = (sets[..., axis] < limit).mean(axis=1)
-        # Some patterns have exactly so many on each side
+        # Some patterns have exactly this number on each side
         error = share.std(ddof=1) / np.sqrt(len(share))
         assert abs(share.mean() - limit) <= 4 * error + 1e-9
 
 
 def test_rounding_does_not_reach_the_upper_end(monkeypatch):
     last = 1 - 2.0**-53
-    monkeypatch.setitem(patterns._MAKERS, "independent", lambda n, d, _: np.full((n, d), last))
+    monkeypatch.setitem(patterns.MAKERS, "independent", lambda n, d, _: np.full((n, d), last))
     assert np.float32(points("independent", 2).max()) < 1
     np.testing.assert_array_equal(shifted([-1e-20, 0.5, np.nan], 0), [0, 0.5, np.nan])
 
@@ -354,7 +354,7 @@ def test_stratified_points_have_a_cell_each(dimension, count):
 
 @pytest.mark.parametrize("count, dimension", [(31, 2), (32, 2), (34, 3)])
 def test_the_lattice_is_the_best_that_powers_make(count, dimension):
-    """By the dual lattice: only few and high frequencies alias."""
+    """The criterion is the dual lattice: few frequencies alias, and only high ones."""
     reach = 60 if dimension == 2 else 20
     h = np.array(list(itertools.product(range(-reach, reach + 1), repeat=dimension)))
     decay = 1 / np.prod(np.maximum(1, np.abs(h)) ** 2.0, axis=1)

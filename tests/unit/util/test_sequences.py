@@ -27,7 +27,7 @@ def _seeded(kind: str, count: int, pixels: int = 1, seed: int = 0, **parameters:
 
 
 def _points(sampler: mi.Sampler, pairs: int, pixels: int = 1) -> np.ndarray:
-    """Of each pixel: [pixel, sample, dimension]."""
+    """The points of each pixel: [pixel, sample, dimension]."""
     drawn = [np.array(sampler.next_2d()).T for _ in range(pairs)]
     return np.concatenate(drawn, axis=1).reshape(pixels, -1, 2 * pairs)
 
@@ -82,7 +82,7 @@ def test_points_of_faure_are_a_net_in_any_two_dimensions(dimensions: int) -> Non
             assert _cells(pixel[:, i], pixel[:, j], base, base) == base**2
 
 
-def test_direction_numbers_are_those_of_scipy() -> None:
+def test_direction_numbers_agree_with_scipy() -> None:
     from mitsuba_ext.util.sequences.sobol import _direction_numbers
 
     columns = _direction_numbers(8)
@@ -95,7 +95,7 @@ def test_direction_numbers_are_those_of_scipy() -> None:
 
 
 @pytest.mark.parametrize("kind", ["sobol_owen", "halton", "faure", "hammersley"])
-def test_discrepancy_is_less_than_that_of_random_points(kind: str) -> None:
+def test_discrepancy_is_less_than_for_random_points(kind: str) -> None:
     points = _points(_seeded(kind, 128, 4), 2, 4)
     independent = np.random.default_rng(1).random(points.shape)
     ours, theirs = (
@@ -161,7 +161,7 @@ def test_passes_go_on_with_one_sequence(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SAMPLERS)
-def test_a_clone_goes_on_and_a_fork_begins(kind: str) -> None:
+def test_a_clone_continues_and_a_fork_starts_again(kind: str) -> None:
     sampler = _seeded(kind, 8, 2, seed=3)
     sampler.next_1d()
     clone, fork = sampler.clone(), sampler.fork()

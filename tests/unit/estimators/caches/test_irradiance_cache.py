@@ -1,5 +1,5 @@
 """Irradiance caching: gradients against analytic ones, interpolation, placement, its images against
-``path``, its file, and what it refuses. (``techniques.py`` has the tests that all integrators
+``path``, its file, and what it refuses. (``tests/claims`` has the tests that all techniques
 share.)"""
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def make(max_depth: int = 6, **parameters: Any) -> mi.Integrator:
-    """As many records as the view needs, however few samples there are."""
+    """An integrator that makes all records that the view needs, even with few samples."""
     parameters = {"max_depth": max_depth, "effort": 1e5, **parameters}
     return mi.load_dict({"type": "irradiance_cache", **parameters})
 
@@ -139,7 +139,7 @@ def test_a_linear_field_is_interpolated_exactly() -> None:
     assert np.array(E)[0][found] == pytest.approx((1 + x @ slope)[found], rel=1e-5)
 
 
-def test_the_weights_are_those_of_a_search_through_all_records() -> None:
+def test_the_weights_agree_with_a_search_through_all_records() -> None:
     reach = np.random.default_rng(4).uniform(0.2, 20.0, 300) ** 0.7
     kept, x = records(on_plane(300, 5), reach, np.zeros(3)), on_plane(2000, 6)
     kept.irradiance = np.random.default_rng(7).uniform(0, 1, kept.irradiance.shape)
@@ -188,7 +188,7 @@ def test_a_record_is_not_valid_where_it_mispredicts_another() -> None:
 # ---- Images ----
 
 
-def test_the_mean_is_that_of_path() -> None:
+def test_the_mean_agrees_with_path() -> None:
     """Direct light, glossy and specular parts, and cached light add up, with nothing twice."""
     scene = mi.load_dict(stage(**things()), optimize=False)
     # On a film of 16x16, a pixel is as wide as details are
@@ -199,7 +199,7 @@ def test_the_mean_is_that_of_path() -> None:
 
 
 @pytest.mark.parametrize("max_depth", [1, 2])
-def test_direct_light_is_that_of_path(max_depth: int) -> None:
+def test_direct_light_agrees_with_path(max_depth: int) -> None:
     scene = mi.load_dict(stage(), optimize=False)
     images = [
         np.array(mi.render(scene, integrator=integrator, spp=8, seed=3))

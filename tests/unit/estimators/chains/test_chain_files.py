@@ -1,4 +1,4 @@
-"""A render with chains goes on from the file of an earlier one, as if there had been no break."""
+"""A render with chains continues the file of an earlier render as if there had been no break."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_arrays_are_put_together_as_they_were() -> None:
     {}, {"two_stage": True}, {"direct_samples": 16}, {"kelemen_style_weights": False},
     pytest.param({"bidirectional": True}, marks=pytest.mark.slow),
 ], ids=str)  # fmt: skip
-def test_a_render_goes_on_where_it_was_stopped(tmp_path: Path, parameters: dict) -> None:
+def test_a_render_continues_where_it_was_stopped(tmp_path: Path, parameters: dict) -> None:
     """With the same samples to start from, up to rounding."""
     scene, file = mi.load_dict(stage()), tmp_path / "chains.npz"
     spp = 8 if parameters.get("bidirectional") else 64
@@ -82,10 +82,10 @@ def test_a_render_goes_on_where_it_was_stopped(tmp_path: Path, parameters: dict)
 
 
 @pytest.mark.parametrize("which", some("erpt", of=_OTHERS))
-def test_renders_of_other_kinds_go_on_where_they_were_stopped(
+def test_renders_of_other_kinds_continue_where_they_were_stopped(
     tmp_path: Path, which: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also those of chains of paths, and of batches."""
+    """Files of chains of paths, and of batches, too."""
     monkeypatch.setattr(RedistributionRender, "max_batch", 32**2)
     monkeypatch.setattr(PathChains, "launch", 4)
     scene, file = mi.load_dict(stage()), tmp_path / "chains.npz"

@@ -67,7 +67,7 @@ def _run(
     count: int = 1024,
     bootstrap: int = 4096,
 ) -> tuple[Chains, Histogram, np.ndarray]:
-    """Chains after so many mutations, what they saw, and their estimate of the integrals."""
+    """Chains after a number of mutations, the visits, and the estimate of the integrals."""
     samples = Bootstrap(target, seed, bootstrap)
     image = Histogram()
     weight = large_step * samples.mean if kelemen else 0.0
@@ -80,7 +80,7 @@ def _run(
 
 
 def _assert_unbiased(estimates: np.ndarray, exact: np.ndarray, precision: float) -> None:
-    """Of independent seeds: [seed, y, x]."""
+    """The estimates come from independent seeds: [seed, y, x]."""
     assert not estimates[:, exact == 0].any()
     known = estimates[:, exact > 0]
     z = np.array([z_exact(e, x)[0] for e, x in zip(known.T, exact[exact > 0])])
@@ -195,7 +195,7 @@ class _NoImage:
 
 
 @pytest.mark.parametrize("steps", [0, 1, 37])
-def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
+def test_a_stored_state_agrees_with_its_numbers(steps: int) -> None:
     """Bit for bit: a chain forgets nothing of a path that it may come from."""
     target, count = _walk_target(), 2048
     rules = ChainRules(0.3, SmallSteps(), 0.0)
@@ -228,7 +228,7 @@ def test_samples_of_the_bootstrap_lie_in_one_cell_each() -> None:
 
 
 def test_samples_are_chosen_in_proportion_to_the_target() -> None:
-    """As often as expected, up to one; black ones never."""
+    """Each is chosen as often as expected, give or take one; black samples are never chosen."""
     samples, count = Bootstrap(TARGETS["ramp"][0], 3, 1000), 5000
     found, _ = ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
     expected = found.target.numpy() / found.target.numpy().sum() * count
@@ -237,7 +237,7 @@ def test_samples_are_chosen_in_proportion_to_the_target() -> None:
     assert np.abs(chosen - expected).max() < 1 + 1e-3
 
 
-def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
+def test_the_mean_of_the_bootstrap_is_the_mean_of_the_target() -> None:
     for name, (target, exact) in TARGETS.items():
         means = np.array([Bootstrap(target, seed, 100).mean for seed in range(1, 65)])
         z, error = z_exact(means, exact.sum())
@@ -245,7 +245,8 @@ def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
 
 
 def test_the_bootstrap_knows_the_error_of_its_mean() -> None:
-    """As that of samples without strata, which these are where only the other numbers matter."""
+    """The error is the error of samples without strata, because only numbers without strata matter
+    here."""
 
     def rare(numbers: Any) -> tuple[Contribution, Sample]:
         place, x = numbers.next_2d(), numbers.next_1d()
@@ -311,7 +312,7 @@ def test_small_steps_stay_in_the_interval(steps: SmallSteps) -> None:
 
 
 @pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "lanczos"])
-def test_mean_weights_are_those_of_many_camera_samples(rfilter: str) -> None:
+def test_mean_weights_agree_with_many_camera_samples(rfilter: str) -> None:
     camera = mi.load_dict(sensor(film=film(7, 5, rfilter={"type": rfilter})))
     camera.film().prepare([])
     block, spp = camera.film().create_block(), 1 << 14

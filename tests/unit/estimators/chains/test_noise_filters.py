@@ -1,4 +1,4 @@
-"""Noise filters of chains: what they leave out, and what they even out."""
+"""Noise filters of chains: the visits that they drop, and the pixels that they even out."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Image(Histogram):
 
 
 def _visits(pixels: float, most: int, steps: int = 40, count: int = 512) -> tuple[float, int]:
-    """Visits that chains add to the image, and their proposals. The film is so many pixels wide,
+    """Visits that chains add to the image, and their proposals. The film is ``pixels`` wide,
     and as high."""
 
     def hill(numbers: Any) -> Any:

@@ -22,7 +22,7 @@ NEAR, FAR = 1.0, 4.0
 
 
 def a_lens(focus: float = 2.0, radius: float = 12.0, width: int = WIDTH) -> ThinLens:
-    """``radius``: that of the circle of confusion of what is near, in pixels."""
+    """``radius``: the radius of the circle of confusion of near objects, in pixels."""
     fov = 45.0
     per_unit = abs(1 / NEAR - 1 / focus) * width / (2 * math.tan(math.radians(fov) / 2))
     return ThinLens(radius / per_unit, focus, fov, width)
@@ -58,7 +58,7 @@ def of_layers(name: str, parts, cap: float) -> np.ndarray:
 # ---- The lens ----
 
 
-def test_circle_of_confusion_is_that_of_a_traced_thin_lens():
+def test_circle_of_confusion_agrees_with_a_traced_thin_lens():
     """Rays of Mitsuba's sensor, from the edge and the middle of the aperture."""
     lens = ThinLens(0.1, 3.0, 40.0, 200)
     sensor = mi.load_dict({
@@ -83,7 +83,7 @@ def test_circle_of_confusion_is_that_of_a_traced_thin_lens():
 @pytest.mark.parametrize("wrong", [
     {"aperture_radius": -1.0}, {"focus_distance": 0.0}, {"fov": 180.0}, {"film_width": 0},
 ])  # fmt: skip
-def test_a_lens_that_cannot_be_is_refused(wrong):
+def test_an_impossible_lens_is_refused(wrong):
     parameters = {"aperture_radius": 0.1, "focus_distance": 3.0, "fov": 40.0, "film_width": 9}
     with pytest.raises(ValueError, match=next(iter(wrong))):
         ThinLens(**{**parameters, **wrong})
@@ -176,7 +176,7 @@ def test_bars_behind_an_edge_are_shifted_and_sharper_as_geometry_says(t):
 
 @pytest.mark.parametrize("t", [-0.5, 0.0, 0.5])
 def test_effective_circle_makes_the_image_narrower_and_moves_it_from_the_edge(t):
-    """The source's model: its Gaussian α is steeper than that of the disk."""
+    """The source's model: its Gaussian α is steeper than the α of the disk."""
     total, mean, width = _moments(_point_behind_an_edge("effective", t))
     _, centre, whole = _moments(_point_behind_an_edge("effective", 3.0))
     assert centre == pytest.approx(48, abs=0.6) and whole == pytest.approx(8, abs=0.8)
@@ -196,7 +196,7 @@ def test_a_constant_picture_stays_constant_up_to_its_border(name, value):
 
 
 @pytest.mark.parametrize("name", filters.FILTERS)
-def test_what_is_in_focus_is_left_alone(name):
+def test_pixels_in_focus_are_left_alone(name):
     color = np.random.default_rng(1).random((HEIGHT, WIDTH, 3))
     found = blurred(color, np.full((HEIGHT, WIDTH), 2.0), a_lens(), name)
     assert np.allclose(found, color, atol=1e-5)
@@ -239,7 +239,7 @@ def test_opacity_of_the_near_layer_of_0_and_1():
 
 
 @pytest.mark.parametrize("blurs", [(16.0, 6.0), (-6.0, -16.0)])
-def test_of_two_near_or_two_far_objects_the_nearer_one_hides_the_other(blurs):
+def test_the_nearer_of_two_near_or_two_far_objects_hides_the_other(blurs):
     """A half plane before what is bright: its edge is as wide as its own circle."""
     x = np.broadcast_to(np.arange(129), (33, 129))
     front = (x >= 64).astype(float)
@@ -249,7 +249,7 @@ def test_of_two_near_or_two_far_objects_the_nearer_one_hides_the_other(blurs):
     assert np.abs(image - [_segment(t, 0) for t in edge]).max() < 0.06
 
 
-def test_holes_are_filled_from_around_and_what_is_known_stays():
+def test_holes_are_filled_from_around_and_known_pixels_stay():
     size = Size(37, 21)
     random = np.random.default_rng(1)
     known = (random.random(size.count) < 0.2).astype(np.float32)

@@ -63,7 +63,7 @@ def test_a_lamp_that_two_layers_share_is_shown_once():
 
 
 @pytest.mark.parametrize("step, share", [(1, 0.5), (21, 1.0), (-19, 0.0)])
-def test_a_lamp_is_seen_past_what_stands_before_it(step, share):
+def test_a_lamp_is_seen_past_the_objects_before_it(step, share):
     """A dark half plane, blurred by as much on the other side of the focus. The pixel x beside the
     lamp sees it through the lens point x / 20, and the half plane there at 2 x."""
     size, mid = Size(WIDTH, HEIGHT), WIDTH // 2

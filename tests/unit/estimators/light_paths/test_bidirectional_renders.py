@@ -94,7 +94,7 @@ def test_ctrl_c_leaves_the_finished_passes_in_the_film(name: str) -> None:
 @pytest.mark.parametrize("sampler", ["independent", "stratified"])
 @pytest.mark.parametrize("name", NAMES)
 def test_the_timeout_is_kept(monkeypatch: pytest.MonkeyPatch, name: str, sampler: str) -> None:
-    """And the mean of the samples that were taken is right."""
+    """The mean of the samples that fit is right."""
     scene = mi.load_dict(stage(camera=below_the_lamp(sampler=sampler)))
     integrator = TECHNIQUES[name].make(3)
     (whole,) = batches(scene, integrator, 144, [5])
@@ -112,7 +112,7 @@ def test_the_timeout_is_kept(monkeypatch: pytest.MonkeyPatch, name: str, sampler
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_output_variables_are_those_of_the_camera_rays(name: str) -> None:
+def test_output_variables_come_from_the_camera_rays(name: str) -> None:
     """Alpha too. The image is that without them."""
     aovs = "depth:depth,normal:sh_normal"
     camera = sensor(film=film(pixel_format="rgba", rfilter={"type": "gaussian"}))

@@ -1,4 +1,4 @@
-"""The weights of all techniques that find a path add up to 1, and are those of their densities."""
+"""The weights of all techniques that find a path add up to 1 and follow from the densities."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def weights(
     next_event: EmitterSampling | None = None,
     selection: SubpathSelection | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Paths, LightEmission]:
-    """Of paths with so many vertices: [s, path] for those that exist."""
+    """Weights of paths with these numbers of vertices: [s, path] for the paths that exist."""
     found, exists, _, paths, emission = weights_and_ratios(
         scene, light, camera, next_event, selection
     )
@@ -203,7 +203,8 @@ def assert_camera_ratios(
 
 
 def assert_kinds(found: np.ndarray, s: int, squares: np.ndarray) -> None:
-    """``squares``: those of the other connections, and of the light image, for the technique s."""
+    """``squares``: the squares for the other connections, and for the light image, of technique
+    s."""
     own, last = found[s], len(found) - 1
     others = [k for k in range(2, last) if k != s], [last] if s != last else []
     is_clear = own > 1e-3
@@ -304,13 +305,13 @@ def _densities(name: str, paths: Paths, exists: np.ndarray, scene: mi.Scene) -> 
 @pytest.mark.parametrize(
     "name", some("rectangle", "constant", of=["rectangle", "point", "directional", "constant"])
 )
-def test_weights_are_those_of_the_densities(name: str, by_regions: bool) -> None:
+def test_weights_follow_from_the_densities(name: str, by_regions: bool) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
     selection = any_table(weights(scene, 1, 2)[2]) if by_regions else None
     for light, camera in SHAPES:
         found, exists, paths, _ = weights(scene, light, camera, selection=selection)
         densities = _densities(name, paths, exists, scene)
-        # But for hits (0), connections to lights (1) and to the sensor (the last)
+        # Except for hits (0), connections to lights (1) and to the sensor (the last)
         densities[2:-1] *= CONNECTIONS
         densities[-1] *= LIGHT_PATHS
         if selection is not None:

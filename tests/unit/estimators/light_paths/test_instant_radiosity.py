@@ -1,5 +1,5 @@
 """Instant radiosity: its images against ``path``, its choices, its bound, and what it refuses.
-(``techniques.py`` has the tests that all integrators share.)"""
+(``tests/claims`` has the tests that all techniques share.)"""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def assert_image_of_path(
     both: dict[str, Any] | None = None,
     **parameters: Any,
 ) -> None:
-    """The means of the image and of its quarters are those of ``path``."""
+    """The means of the image and of its quarters agree with ``path``."""
     if isinstance(scene, dict):
         scene = mi.load_dict(scene, optimize=False)
     path = mi.load_dict({"type": "path", "max_depth": max_depth, **(both or {})})
@@ -79,8 +79,9 @@ def assert_image_of_path(
 
 
 @pytest.mark.parametrize("max_depth", some(5, of=[2, 3, 5, -1]))
-def test_the_mean_is_that_of_path_at_each_depth(max_depth: int) -> None:
-    """By way of diffuse and rough shiny_things, a mirror, glass, and a ball with a delta lobe."""
+def test_the_mean_agrees_with_path_at_each_depth(max_depth: int) -> None:
+    """Light is scattered by diffuse and rough objects, a mirror, glass, and a ball with a delta
+    lobe."""
     scene = stage(camera=below_the_lamp(), **shiny_things())
     assert_image_of_path(scene, max_depth, 256, 0.02)
 
@@ -131,7 +132,7 @@ def test_furnace_has_the_exact_radiance(choice: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["thinlens", "cropped"])
-def test_films_and_sensors_are_those_of_path(name: str) -> None:
+def test_films_and_sensors_show_what_path_shows(name: str) -> None:
     changes = {"thinlens": {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
                "cropped": {"film": film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13,
                                         crop_height=11, rfilter={"type": "gaussian"})}}[name]
@@ -223,8 +224,8 @@ def test_learned_virtual_lights_are_chosen_as_often_as_their_weights_say() -> No
 
 
 def test_several_connections_are_spread_over_the_virtual_lights() -> None:
-    """As many connections as virtual lights use about each of them: there is less noise than that
-    of independent choices, which falls with their number."""
+    """With a connection for each virtual light, about all of them are used. There is less noise
+    than with independent choices, whose noise falls with their number."""
     scene = mi.load_dict(stage(), optimize=False)
     noise = [
         batches(scene, make(3, connections=n, bound=1.0), 16, SEEDS[:4]).var(axis=0).mean()
@@ -263,7 +264,7 @@ def _corner() -> mi.Scene:
 
 
 def test_a_bounded_corner_without_compensation_is_darker() -> None:
-    """And the more so the tighter the bound; with compensation, it is not."""
+    """A tighter bound makes it darker still. With compensation, it is not darker."""
     scene = _corner()
     means = [
         batches(scene, make(3, bound=bound, compensation=compensation), 128, SEEDS[:4]).mean()
@@ -276,7 +277,7 @@ def test_a_bounded_corner_without_compensation_is_darker() -> None:
 
 
 def test_the_bound_tames_the_weak_singularity_in_a_corner() -> None:
-    """Also with compensation, no sample is far brighter than the image."""
+    """With compensation too, no sample is far brighter than the image."""
     scene = _corner()
     bounded, unbounded = (
         batches(scene, make(3, bound=bound), 1, range(1, 33)) for bound in (3.0, 1e9)
@@ -354,7 +355,8 @@ def _layers(images: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     pytest.param({"interleaving": 2, "samples_per_pass": 2}, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_the_parts_of_the_image_add_up_to_it(parameters: dict[str, Any]) -> None:
-    """By way of diffuse and rough shiny_things, a mirror, glass, and a ball with a delta lobe."""
+    """Light is scattered by diffuse and rough objects, a mirror, glass, and a ball with a delta
+    lobe."""
     scene = mi.load_dict(stage(camera=below_the_lamp(), **shiny_things()), optimize=False)
     image, layers = _layers(batches(scene, make(5, light_aovs=True, **parameters), 8, [1]))
     total = layers["direct"] + layers["virtual"] + layers["compensation"]
@@ -362,7 +364,7 @@ def test_the_parts_of_the_image_add_up_to_it(parameters: dict[str, Any]) -> None
     assert all(layer.mean() > 0 for layer in layers.values())
 
 
-def test_direct_light_is_that_of_path_and_the_rest_is_indirect() -> None:
+def test_direct_light_agrees_with_path_and_the_rest_is_indirect() -> None:
     scene = _corner()
     _, layers = _layers(batches(scene, make(3, light_aovs=True), 64, SEEDS[:4]))
     both = [

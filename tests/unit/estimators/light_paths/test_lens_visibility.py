@@ -1,4 +1,4 @@
-"""Light paths choose points of the aperture by visibility, and the image stays that of ``path``."""
+"""Light paths choose points of the aperture by visibility, and the image agrees with ``path``."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_pieces_are_chosen_with_the_densities_that_weights_say(table: str) -> No
     column, row = np.minimum((numbers * lens._pieces).astype(int), lens._pieces - 1)
     expected = likes[np.arange(64 * count) // count, row, column] * lens._count
     is_same = np.abs(density / expected - 1) < 1e-4
-    # But for numbers that were rounded to the next piece
+    # Except for numbers that were rounded to the next piece
     assert is_same.mean() > 0.9999
     # Four bins of each piece, also within it
     bins = 2 * lens._pieces

@@ -155,7 +155,7 @@ def _caustic(bsdf: dict[str, Any]) -> mi.Scene:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bsdf", ["conductor", "plastic"])
-def test_caustics_of_bumps_are_those_of_path(bsdf: str) -> None:
+def test_caustics_of_bumps_agree_with_path(bsdf: str) -> None:
     """Where the map does not turn towards the viewer: docs/mitsuba_faults.md."""
     scene = _caustic({"type": "bumpmap", "arbitrary": _bumps(), "flip_invalid_normals": False,
                       "bsdf": {"type": bsdf}})  # fmt: skip
@@ -211,7 +211,7 @@ SCENES = {"ball": _ball, "shell": _shell}
         ("ball", "roughdielectric", "mlt", 2048),
     ],
 ))  # fmt: skip
-def test_the_image_is_that_of_path(where: str, name: str, integrator: str, spp: int) -> None:
+def test_the_image_agrees_with_path(where: str, name: str, integrator: str, spp: int) -> None:
     scene = SCENES[where](BSDFS[name]())
     ours = mi.load_dict({"type": integrator, "max_depth": 5})
     path = mi.load_dict({"type": "path", "max_depth": 5})
@@ -220,7 +220,7 @@ def test_the_image_is_that_of_path(where: str, name: str, integrator: str, spp: 
     assert_same_quarters(images, expected, 0.006)
 
 
-def test_bsdfs_that_were_freed_are_not_among_those_in_memory() -> None:
+def test_freed_bsdfs_are_not_among_the_bsdfs_in_memory() -> None:
     kept = [mi.load_dict(diffuse(0.5)) for _ in range(20)]
     del kept[3:17]
     gc.collect()

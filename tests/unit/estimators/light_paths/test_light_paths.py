@@ -1,4 +1,4 @@
-"""``light_paths``: how many, and those of their techniques that pay."""
+"""``light_paths``: the number of light paths, and the techniques that pay."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_path_takes_nearly_as_long_where_it_traces_no_shadow_rays() -> None:
 
 @pytest.mark.parametrize("ball", [{"type": "diffuse"}, {"type": "conductor"}])
 def test_light_paths_are_dropped_under_an_open_sky(ball: dict[str, Any]) -> None:
-    """Also where some light comes by way of a mirror: ``path`` runs into the sky."""
+    """This includes light by way of a mirror, because the rays of ``path`` hit the sky."""
     integrator = _auto()
     scene = {**stage_with_ball(ball), "light": EMITTERS["constant"]()}
     mi.render(mi.load_dict(scene, optimize=False), integrator=integrator, spp=256)
@@ -80,8 +80,8 @@ def test_without_lights_there_is_nothing_to_choose() -> None:
 def test_light_that_path_cannot_find_keeps_light_paths_if_it_exceeds_the_noise(
     spp: int, is_kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A caustic of a point, in a render of so many samples. The learner is told that number: these
-    renders have fewer."""
+    """The caustic of a point light, in a render of ``spp`` samples. The trial is told that number;
+    the test itself renders fewer."""
     make = light_paths.LightPathTrial.__init__
 
     def of_length(trial, film, _) -> None:
@@ -143,7 +143,7 @@ def test_the_variance_of_path_is_predicted_below_water() -> None:
 def test_the_variance_of_path_is_predicted_whatever_weights_connections_have(
     vertices: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All light is indirect, and MIS weights assume so many vertices of a light path."""
+    """All light is indirect, and MIS weights assume this number of vertices of a light path."""
     monkeypatch.setattr(path_tracer, "_VERTICES", vertices)
     assert_variance_of_path_is_predicted(_below_a_ceiling(diffuse()), light_image=False)
 
@@ -237,7 +237,7 @@ ALONE = {
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_weights_are_those_of_the_densities_that_light_paths_know(
+def test_weights_follow_from_the_densities_that_light_paths_know(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where camera paths alone are the only other techniques, and the number of vertices of a light

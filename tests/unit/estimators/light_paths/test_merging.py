@@ -80,7 +80,7 @@ def test_sppm_shows_what_radiance_meters_see() -> None:
 
 
 @pytest.mark.parametrize("parameters", [{"merging": "none"}, {}])
-def test_without_caustics_the_image_is_that_of_bdpt(parameters: dict) -> None:
+def test_without_caustics_the_image_agrees_with_bdpt(parameters: dict) -> None:
     scene = load("cornell_box", width=16, height=12)
     images = [
         batches(scene, make(name, **more), 8, [1])
@@ -124,7 +124,7 @@ def test_a_sensor_of_one_ray_has_the_radiance_of_path(name: str) -> None:
 
 
 @pytest.mark.parametrize("radius", [0.8, 0.4])
-def test_the_bias_is_that_of_a_disk(radius: float) -> None:
+def test_the_bias_is_the_mean_over_a_disk(radius: float) -> None:
     """Light of a point at height 1 falls as (1 + d²)^(-3/2) with the distance from below it."""
     T = mi.ScalarTransform4f
     light = {"type": "spot", "cutoff_angle": 40.0, "beam_width": 39.9, "intensity": 1.0,

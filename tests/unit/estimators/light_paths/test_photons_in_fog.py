@@ -75,7 +75,7 @@ def test_spectral_fog_has_the_mean_of_volpath(variant: str) -> None:
     assert_same_quarters(found, batches(scene, make("volpath"), 1024, range(101, 109)), 0.03)
 
 
-def test_white_fog_in_a_white_world_is_invisible_but_for_the_bias_at_its_surface() -> None:
+def test_white_fog_in_a_white_world_is_invisible_except_for_the_bias_at_its_surface() -> None:
     """Where a ball reaches out of the fog, it finds too little. That falls with the radius."""
     scene = mi.load_dict({"type": "scene", "sensor": camera(), "fog": cube(homogeneous(2.0, 1.0)),
                           "sky": {"type": "constant"}}, optimize=False)  # fmt: skip

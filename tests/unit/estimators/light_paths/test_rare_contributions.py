@@ -29,7 +29,7 @@ def _rare(found: np.ndarray, spp: float, share: float = 1e-3):
     return rare(found, np.ones(PIXELS), WIDTH, spp, [share])[0]
 
 
-def test_light_that_no_sample_finds_is_missing() -> None:
+def test_light_that_no_sample_finds_counts_as_missing() -> None:
     found = _found((SOME, 1.0, 2.0))
     found[:, -1, 0] = 0.25
     lacks = _rare(found, spp=100)
@@ -67,7 +67,7 @@ def test_the_square_of_missing_light_is_free_of_noise() -> None:
 
 
 @pytest.mark.parametrize("spp", [8, 512])
-def test_the_error_is_that_of_renders_without_their_brightest_pixels(spp: int) -> None:
+def test_the_error_agrees_with_renders_without_their_brightest_pixels(spp: int) -> None:
     """Against renders that draw contributions: in 8 samples, sparks are in fewer than one pixel of
     a thousand; in 512, in more."""
     kinds = [(0.5, 2.0), (2e-5, 1e4)]

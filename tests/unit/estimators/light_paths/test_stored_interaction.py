@@ -1,4 +1,4 @@
-"""What is read back of a stored vertex is what the light walk saw."""
+"""A stored vertex is read back as the light walk saw it."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_bsdf_has_the_same_value_and_density_at_a_stored_interaction(bsdf: str
         np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-4, atol=1e-5)
 
 
-def test_of_other_bsdfs_and_textures_everything_is_stored() -> None:
+def test_the_whole_interaction_is_stored_for_other_bsdfs_and_textures() -> None:
     hair = {"type": "hair"}
     nested = {"type": "twosided", "bsdf": _bumps("bump")}
     attribute = {

@@ -1,4 +1,5 @@
-"""``bdpt`` with ``subpath_selection``: light vertices are chosen by what pilots have learned."""
+"""``bdpt`` with ``subpath_selection`` chooses light vertices by weights that pilots have
+learned."""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", some("wall", of=SCENES))
-def test_the_image_is_that_of_path(name: str, always: None) -> None:
+def test_the_image_agrees_with_path(name: str, always: None) -> None:
     assert_image_of_path(SCENES[name](), precision=0.01, subpath_selection="visibility")
 
 
@@ -91,7 +92,7 @@ def test_learning_ends_where_it_would_not_pay() -> None:
     assert "uniformly chosen" in integrator.statistics.learned
 
 
-def test_uniform_is_what_is_done_by_default() -> None:
+def test_uniform_is_the_default() -> None:
     scene = mi.load_dict(stage(camera=below_the_lamp()))
     default, uniform = (
         batches(scene, bdpt(**p), 16, [3])[0] for p in ({}, {"subpath_selection": "uniform"})
@@ -136,7 +137,7 @@ def test_where_light_paths_are_not_shared_nothing_is_learned(variant: str) -> No
     assert not integrator.learners
 
 
-def test_what_was_learned_is_restored(tmp_path, always: None) -> None:
+def test_the_learned_selection_is_restored(tmp_path, always: None) -> None:
     scene, file = mi.load_dict(stage(camera=below_the_lamp(), wall=wall())), tmp_path / "learned"
     saves = bdpt(subpath_selection="visibility", save_learned=str(file))
     saved = batches(scene, saves, 64, [3])[0]

@@ -60,7 +60,7 @@ def test_each_technique_finds_all_paths_of_a_length(tmp_path: Path) -> None:
     scene, file = _scene(), str(tmp_path / "all.exr")
 
     def means(seeds: range) -> dict[tuple[int, int], np.ndarray]:
-        """By technique: [seed, weighted or plain]."""
+        """The means of each technique: [seed, weighted or plain]."""
         found: dict[tuple[int, int], list] = {}
         for seed in seeds:
             _, integrator = _render(scene, seed, 512, technique_images=file)
@@ -80,7 +80,7 @@ def test_each_technique_finds_all_paths_of_a_length(tmp_path: Path) -> None:
             assert error < 0.1 * expected.mean(), (s, k + 1 - s, "known badly")
 
 
-def test_what_cannot_be_combined_with_them_is_refused(tmp_path: Path) -> None:
+def test_parameters_that_cannot_be_combined_with_them_are_refused(tmp_path: Path) -> None:
     for parameters in (
         {"technique_images": str(tmp_path / "a.exr"), "light_paths": "auto"},
         {"sample_direct": False, "next_event": "power"},

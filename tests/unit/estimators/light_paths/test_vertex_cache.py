@@ -1,4 +1,4 @@
-"""Light paths are stored in rounds, and joined to one list."""
+"""Light paths are stored in rounds and joined into one list."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LANES, DEPTH = 1000, 7
 
 
 def _rounds(scene: mi.Scene, stride: int) -> list[LightVertices]:
-    """The same paths, so many vertices at a time."""
+    """The same paths, with ``stride`` vertices stored at a time."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, LANES)
     walk = LightWalk(LightEmission(scene), DEPTH, 100, PartialSums(EmitterSampling()))

@@ -1,4 +1,4 @@
-"""What the learner of path guiding measures, what it decides from that, and how much it keeps."""
+"""The measurements of the learner of path guiding, its decisions, and the memory that it keeps."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class _Listening(GuideLearner):
         return self.found
 
 
-def test_gain_of_each_share_is_that_of_its_density() -> None:
+def test_gain_of_each_share_follows_from_its_density() -> None:
     """Relative errors count; what the pilots before have drawn does not."""
     learner = _learner(_Listening, always=True)
     _pilot(learner, 1)
@@ -129,7 +129,7 @@ class _Measured(GuideLearner):
 
 
 @pytest.mark.parametrize("always", [False, True])
-def test_a_guide_that_does_not_pay_is_given_up_unless_told_otherwise(always: bool) -> None:
+def test_a_guide_that_does_not_pay_is_dropped_unless_it_is_forced(always: bool) -> None:
     learner = _learner(_Measured, always=always)
     for seed in range(2):
         _pilot(learner, seed)
@@ -243,7 +243,7 @@ def test_memory_is_bounded_where_no_path_ends() -> None:
     assert taken[1] - taken[0] < 1.25 * 16 * 2**20, taken
 
 
-def test_importance_is_that_of_the_place_in_the_image() -> None:
+def test_importance_follows_the_place_in_the_image() -> None:
     """Errors are relative to the mean of the pixels around, and to little of all."""
     width, count = 32, 4
     pixels = PixelEstimates(width)

@@ -1,4 +1,4 @@
-"""What path guiding records of paths, and the regions and tiles whose trees learn from it."""
+"""The records of path guiding, and the regions and tiles whose trees learn from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def _pass(records: PathRecords, bounces: list[int], samples: np.ndarray) -> None:
-    """Paths that end after so many bounces. Each brings 10 before the first, then 1, 2, 3, …"""
+    """Paths that end after ``bounces``. Each brings 10 before the first bounce, then 1, 2, 3, …"""
     lanes = len(bounces)
     records.begin(lanes, dr.arange(mi.UInt32, lanes))
     for depth in range(max(bounces)):
@@ -50,7 +50,7 @@ def _recorded(stride: int = 1, passes: int = 1) -> tuple[PathRecords, np.ndarray
     return records, samples, bounces
 
 
-def test_records_hold_what_paths_brought_after_each_bounce() -> None:
+def test_records_hold_the_light_of_paths_after_each_bounce() -> None:
     records, samples, bounces = _recorded()
     expected = [
         (depth, lane, sum(range(depth + 1, bounces[lane] + 1)), 2.0 + depth)
@@ -177,7 +177,7 @@ def _labels(regions: SurfaceRegions, *where, active: bool = True) -> np.ndarray:
     return regions.label(_interaction(*where), None, mi.Bool(active)).numpy()
 
 
-def test_every_point_has_a_region_and_points_elsewhere_that_of_everything(
+def test_every_point_has_a_region_and_unknown_points_have_the_region_of_everything(
     surfaces: SurfaceRegions,
 ) -> None:
     p, n = _points(20_000)
@@ -283,8 +283,8 @@ def test_pixels_are_in_their_tiles(width: int, height: int, tile: int) -> None:
 
 
 def _tile_trees(width: int, height: int, tile: int) -> tuple[TileRegions, SampleTrees]:
-    """Of paths whose second sample is to lie on the side where the first one was. Light comes in
-    the left half of the film only, and more of it by way of small numbers."""
+    """Trees of paths whose second sample must lie on the side of the first one. Only the left half
+    of the film gets light, and small numbers bring more of it."""
     count = 1 << 16
     random = np.random.default_rng(5)
     regions = TileRegions(width, height, tile)
@@ -334,7 +334,7 @@ def test_the_first_sample_of_a_path_decides_about_the_tree_of_the_second(tile: i
     assert (regions.after(state, trees, leaf, mi.Bool(False)) == state).numpy().all()
 
 
-def test_a_tile_that_found_nothing_expects_what_its_surroundings_found() -> None:
+def test_a_tile_that_found_nothing_expects_the_light_of_its_surroundings() -> None:
     regions, trees = _tile_trees(16, 8, 4)
     tile = regions.begin(mi.UInt32([15]))
     assert trees.density(tile, mi.Point2f(0.2, 0.5), mi.Bool(True))[0].numpy()[0] > 1.1
@@ -372,7 +372,7 @@ def _one_tile(u: np.ndarray, value: np.ndarray, goes_on: list[np.ndarray]) -> tu
     return regions, after
 
 
-def test_a_tree_below_a_rare_leaf_expects_what_its_tile_found() -> None:
+def test_a_tree_below_a_rare_leaf_expects_the_light_of_its_tile() -> None:
     """First samples with large numbers are two of 4,000."""
     u = np.random.default_rng(7).random((2, 2, 4000), dtype=np.float32)
     u[0, 0] *= 0.5

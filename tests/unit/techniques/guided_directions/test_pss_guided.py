@@ -1,4 +1,4 @@
-"""Path guiding: unbiased in all cases, more efficient behind a door, off where it gains nothing."""
+"""Path guiding is unbiased, more efficient behind a door, and off where it gains nothing."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def reference() -> np.ndarray:
     ],
     ids=str,
 )
-def test_mean_is_that_of_path_whatever_is_guided(
+def test_mean_agrees_with_path_whatever_is_guided(
     parameters: dict[str, Any], reference: np.ndarray
 ) -> None:
     integrator = insisting(pilot_spp=128, **parameters)
@@ -220,7 +220,7 @@ def test_nothing_is_guided_where_nothing_is_gained(
 @pytest.mark.parametrize(
     "parameters", [{}, pytest.param(TILES, marks=pytest.mark.slow)], ids=["surfaces", "tiles"]
 )
-def test_renders_between_change_nothing(parameters: dict[str, Any]) -> None:
+def test_renders_in_between_change_nothing(parameters: dict[str, Any]) -> None:
     """Another scene, another film, another number of samples, another seed."""
     scene, integrator = hidden_lamp(), insisting(**parameters)
     first = batches(scene, integrator, 48, [7])[0]

@@ -49,7 +49,7 @@ def _probability(throughput: float, radiance: float, pixel: float, depth: int = 
     return float(p[0])
 
 
-def test_paths_survive_in_proportion_to_what_they_are_expected_to_bring() -> None:
+def test_paths_survive_in_proportion_to_their_expected_light() -> None:
     one = _probability(0.04, 2.0, 2.0)
     assert 0.1 < one < 0.5
     assert _probability(0.08, 2.0, 2.0) == pytest.approx(2 * one)
@@ -95,7 +95,7 @@ def test_a_black_image_has_a_finite_scale() -> None:
     assert np.isfinite(pixels.scale().numpy()).all()
 
 
-def test_a_region_expects_what_the_one_around_it_found() -> None:
+def test_a_region_expects_the_light_of_the_region_around_it() -> None:
     """Two corners of a cube; the second has few samples."""
     p = np.array([[0.1, 0.9], [0.1, 0.9], [0.1, 0.9]]).repeat(8, axis=1)
     up = np.tile([[0], [0], [1]], 16)
@@ -151,8 +151,9 @@ def _trial(survival: float, weights: tuple[float, float]) -> RouletteTrial:
 
 
 @pytest.mark.parametrize("survival", [1.0, 0.7])
-def test_effects_are_those_of_what_was_not_drawn(survival: float) -> None:
-    """The probabilities of ``path`` are 0.8 both times: what survives has lost nothing."""
+def test_the_effects_of_other_roulettes_are_estimated_too(survival: float) -> None:
+    """The probabilities of ``path`` are 0.8 both times, because surviving paths lose no
+    throughput."""
     trial, lanes = _trial(survival, (0.6, 3.0)), 1 << 17
     squares = {"drawn": 4 * 0.5 * 0.6 / survival**2, "by_throughput": 4 * 0.5 * 0.6 / 0.64,
                "unguided": 4 * 0.5 / 0.64}  # fmt: skip
@@ -208,14 +209,14 @@ def test_learned_roulette_is_unbiased(make, max_depth: int) -> None:
 
 
 @pytest.mark.parametrize("parameters", [{"rr_depth": 8}, {"regions": "tiles"}])
-def test_where_no_roulette_is_learned_it_is_that_of_path(parameters: dict[str, Any]) -> None:
+def test_without_a_learned_roulette_the_one_of_path_is_used(parameters: dict[str, Any]) -> None:
     integrator = TECHNIQUES["pss_guided"].make(8, **parameters)
     mi.render(_lamp_in_glass(), integrator=integrator, spp=64)
     assert integrator.learner.trial is None
     assert type(integrator.learner.roulette) is Roulette
 
 
-def test_learned_roulette_is_given_up_where_that_of_path_is_better(monkeypatch) -> None:
+def test_learned_roulette_is_dropped_where_the_one_of_path_is_better(monkeypatch) -> None:
     finish = RouletteTrial.finish
 
     def worse(self) -> None:

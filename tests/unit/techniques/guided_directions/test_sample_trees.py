@@ -148,7 +148,7 @@ def test_samples_are_distributed_by_the_density(name, share):
 
 @pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize("name", CASES)
-def test_densities_are_those_of_the_cells(name, share):
+def test_densities_agree_with_the_cells(name, share):
     """Exactly one on average, at least the share of uniform samples; leaves are told apart."""
     trees = CASES[name]
     forest, values = _forest(trees, share)

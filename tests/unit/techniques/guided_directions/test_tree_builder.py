@@ -1,4 +1,4 @@
-"""Building trees of primary samples: learned and expected densities, and samples to ignore."""
+"""Trees of primary samples are built: learned and expected densities, and samples to ignore."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_few_equal_and_single_enormous_values_give_no_splits(count, value):
     assert _is_uniform(_learned(_uniform(count), value))
 
 
-def test_enormous_values_among_a_million_decide_little():
+def test_enormous_values_among_a_million_have_little_influence():
     """Their squares must not leave the range of integers."""
     u, count = _uniform(1 << 20), 3
     u[:, :count] = 0.7
@@ -113,7 +113,7 @@ def test_faint_differences_give_no_splits():
     assert not _is_uniform(_learned(u, 0.2 + u[0]))
 
 
-def test_a_split_is_kept_for_those_below_it():
+def test_a_split_is_kept_if_splits_below_it_are():
     """On a checkerboard, the first split alone says nothing."""
     u = _uniform(1 << 14)
     table = _table(_learned(u, (u[0] < 0.5) == (u[1] < 0.5)))
@@ -122,7 +122,7 @@ def test_a_split_is_kept_for_those_below_it():
 
 @pytest.mark.parametrize("count", [2 * SPLIT, 1000])
 def test_samples_of_one_cell_leave_the_others_their_prior(count):
-    """The expectation of equal shares is worth so many equal samples, split by split."""
+    """In each split, the expectation of equal shares is worth ``PRIOR`` equal samples."""
     cell = np.full((2, count), 0.5 / CELLS, np.float32)
     table = _table(_learned(cell, 3.0))
     p = (count + 0.5 * PRIOR) / (count + PRIOR)
@@ -165,7 +165,7 @@ def test_samples_of_another_density_give_the_same_tree_if_they_are_weighted(name
     assert np.abs(weighted - equal).mean() < 0.03
 
 
-def test_shares_are_those_of_the_means_however_dense_the_samples_are():
+def test_shares_follow_the_means_however_dense_the_samples_are():
     """Rounded to a coarse fixed point, small weights once made means too large."""
     u = _uniform(1 << 14)
     is_left = u[0] < 0.5
@@ -198,7 +198,7 @@ def test_the_same_samples_in_another_order_give_the_same_trees():
 
 
 def test_merged_samples_give_the_same_trees():
-    """Of each region, the samples of a cell become one."""
+    """In each region, the samples of a cell are merged into one."""
     count, regions = 50_000, 70
     rng, u = np.random.default_rng(4), _uniform(count)
     region = mi.UInt32(rng.integers(0, regions, count).astype(np.uint32))
@@ -216,8 +216,8 @@ def test_merged_samples_give_the_same_trees():
     assert len(results[0][0]) > 1000 and all(map(np.array_equal, *results))
 
 
-def test_trees_built_together_are_those_built_alone():
-    """Each from its own samples; none from those of a number that is no tree's."""
+def test_trees_built_together_equal_trees_built_alone():
+    """Each tree uses its own samples. Samples whose number belongs to no tree are not used."""
     counts = [3000, 0, SPLIT - 1, 60, 5000]
     functions = [FUNCTIONS[name] for name in ("ramp", "edge", "spot", "spot", "stripes")]
     parts = [_uniform(count, seed) for seed, count in enumerate(counts)]
@@ -290,12 +290,12 @@ def test_a_tree_of_too_few_samples_is_the_expected_one(count):
     np.testing.assert_array_equal(table, expected)
 
 
-def test_a_split_is_kept_for_those_that_are_expected_below_it():
+def test_a_split_is_kept_if_splits_are_expected_below_it():
     table, expected = _with_expected(_uniform(SPLIT), 1.0, "stripes")
     assert expected.max() > 1.9 and np.abs(table - expected).mean() < 0.2
 
 
-def test_the_more_samples_the_less_counts_what_was_expected():
+def test_the_expectation_counts_less_with_more_samples():
     spot, distances = FUNCTIONS["spot"], []
     for count in (40, 1 << 10, 1 << 16):
         u = _uniform(count)
@@ -307,7 +307,7 @@ def test_the_more_samples_the_less_counts_what_was_expected():
     assert (np.diff(from_own) < 0).all() and from_own[-1] < 0.02
 
 
-def test_an_expectation_is_worth_so_many_samples_in_each_cell():
+def test_an_expectation_is_worth_a_number_of_samples_in_each_cell():
     count = 100
     table, expected = _with_expected(np.full((2, count), 0.9, np.float32), 1.0)
     for cut in (lambda t: (t, t[8:]), lambda t: (t[8:], t[8:, 8:])):

@@ -40,7 +40,7 @@ def _sampler(lanes: int) -> mi.Sampler:
 # ---- Probabilities and densities ----
 
 
-def test_the_density_of_a_light_that_is_hit_is_that_of_choosing_it():
+def test_the_density_of_a_light_that_is_hit_is_the_density_of_choosing_it():
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1), c=lamp(-0.5, 0, 1)))
     scene = light_map.cells._emitters._scene
     weights = np.tile([1, 2, 5], light_map.rows.count).astype(np.float32)
@@ -66,7 +66,7 @@ class _Cells:
 
 
 @pytest.mark.parametrize("count", [10_000, 16_384])
-def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
+def test_dim_lights_among_many_are_chosen_with_their_probability(count: int):
     lanes, rounds = 1 << 22, 8
     weights = np.full(count, 1e-3, np.float32) * np.linspace(0.9, 1.1, count, dtype=np.float32)
     weights[::20] = 20
@@ -94,7 +94,7 @@ def test_no_light_has_less_than_its_defensive_share():
 
 
 def test_a_beam_that_the_expectation_misses_keeps_a_share_as_large_as_in_path():
-    """Not that of one of hundreds of bins of the sky."""
+    """The beam does not get the share of one of hundreds of bins of the sky."""
     look = mi.ScalarTransform4f().look_at([0.1, 0.1, 1], [0.1, 0.1, 0], [0, 1, 0])
     beam = {"type": "spot", "cutoff_angle": 0.1, "to_world": look}
     scene = floor(beam=beam, sky={"type": "constant"})
@@ -156,7 +156,7 @@ def test_expectations_of_extreme_lights_are_numbers(radiance: float):
 
 
 @pytest.mark.parametrize("evaluations, runs", [(1 << 22, 1), (200, 2)])
-def test_important_pairs_are_measured_again_as_themselves(evaluations, runs):
+def test_important_pairs_are_measured_again_and_keep_their_places(evaluations, runs):
     calls = []
 
     def measure(row, cell, sampler):
@@ -195,7 +195,7 @@ def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(
     assert ("as path" in str(learner)) == ends and (learner.map is None) == ends
 
 
-def test_cost_of_a_choice_is_that_of_its_segments_shadow_rays_and_of_the_table():
+def test_the_cost_of_a_choice_counts_segments_shadow_rays_and_the_table():
     records = learner_of(floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50)))._records
     # Of 10 paths: connections, shadow rays, and shadow rays with Mitsuba's choice
     records._paths, records._rays = 10, np.array([40.0, 30.0, 20.0])

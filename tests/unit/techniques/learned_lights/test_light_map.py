@@ -1,4 +1,4 @@
-"""Light maps: where paths scatter, what is counted, what is made of it, and files of maps."""
+"""Light maps: the places where paths scatter, the counts, the weights from them, and files."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_scout_finds_surfaces_on_the_side_that_is_seen():
     assert bool(dr.all(dr.abs(dr.dot(n, p) + 1) < 1e-4))
 
 
-def test_a_scout_of_nothing_brings_nothing():
+def test_a_scout_in_an_empty_scene_finds_nothing():
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"},
                           "sky": {"type": "constant"}})
     assert dr.width(_scout(scene).vertices()[0]) == 0
@@ -124,7 +124,7 @@ def test_surroundings_decide_where_nothing_was_tested():
     assert (visibility[:-1, 0] < 0.1).all() and (visibility[:-1, 1] > 0.9).all()
 
 
-def test_where_nothing_was_tested_a_light_is_as_good_as_elsewhere():
+def test_an_untested_light_has_the_visibility_of_other_regions():
     """One lamp arrives and brings nothing, such as one that is not optimized."""
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
     unoccluded = row_of(light_map, light_map.unoccluded)
@@ -154,7 +154,7 @@ def test_one_bright_sample_does_not_decide():
     assert np.isfinite(after) and after < 10 * max(before, 0.3)
 
 
-def test_the_predicted_squares_are_those_of_the_counts():
+def test_the_predicted_squares_follow_from_the_counts():
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
     unoccluded = row_of(light_map, light_map.unoccluded)
     observe(light_map, 0, 20_000, 0, unoccluded[0])
@@ -173,7 +173,7 @@ def row_of_rows(light_map: LightMap, values: mi.Float) -> float:
     return float(values[row])
 
 
-def test_of_a_large_pilot_a_part_is_recorded():
+def test_a_part_of_a_large_pilot_is_recorded():
     scene = floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1))
     p, n = vertices()
     rows = SurfaceRows(region(p), 1, p, n)
@@ -210,7 +210,7 @@ def test_the_roulette_reads_the_chosen_cell():
     assert roulette.rejected_share == pytest.approx(0.5, abs=0.01)
 
 
-def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_lost():
+def test_probabilities_of_a_selection_follow_its_weights_and_no_light_is_lost():
     scene = floor(**{f"lamp_{i}": lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
     light_map = map_of(scene, grid=1)
     rng = np.random.default_rng(1)
@@ -269,7 +269,7 @@ def _two_rooms() -> mi.Scene:
 
 
 def test_a_learned_map_serves_another_view_and_lowers_the_variance(tmp_path: Path):
-    """Without a pilot, the mean stays that of ``path``."""
+    """Without a pilot, the mean agrees with ``path``."""
     scene = _two_rooms()
     maps, files = [], [tmp_path / f"{run}.npz" for run in range(2)]
     for file in files:

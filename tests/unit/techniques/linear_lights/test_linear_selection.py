@@ -87,14 +87,14 @@ def _mixed() -> dict:
 # ---- Unbiased ----
 
 
-def test_mean_with_all_kinds_of_lights_and_glass_is_that_of_path():
+def test_mean_with_all_kinds_of_lights_and_glass_agrees_with_path():
     scene = mi.load_dict(_mixed())
     a = batches(scene, _integrator(4), 256, SEEDS[:8])
     b = batches(scene, REFERENCE.make(4), 256, REFERENCE_SEEDS)
     assert_same_mean(a, b, precision=0.015)
 
 
-def test_mean_with_normal_maps_that_face_away_is_that_of_path():
+def test_mean_with_normal_maps_that_face_away_agrees_with_path():
     """Seen from below, some of the normals say that the surface is seen from above."""
     normal = np.full((4, 4, 3), [1.0, 0.5, 0.6])
     normal[::2] = [0.0, 0.5, 0.6]
@@ -310,7 +310,7 @@ def test_a_thousand_lamps_estimate_the_sum_of_a_thousand_lamps():
     assert value.std() < 0.3 * exact
 
 
-def test_one_emitter_needs_no_estimates_and_none_no_tables():
+def test_one_emitter_needs_no_estimates_and_no_emitter_needs_no_tables():
     scene = _floor(diffuse(), lamp=_panel(0, 0, 1, angle=180))
     selection = LinearChoice(scene)
     sampler = mi.load_dict({"type": "independent"})

@@ -20,7 +20,7 @@ from tests.support.statistical import batches, load
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-#: Densities from nothing to those of near mirrors.
+#: Densities from zero to the densities of near mirrors.
 _DENSITIES = np.concatenate([[0.0], np.geomspace(1e-12, 1e12, 25), [0.1, 0.3]])
 
 _MAKERS = {
@@ -77,7 +77,7 @@ def test_a_word_is_the_nested_plugin_with_its_defaults(heuristic: str) -> None:
     np.testing.assert_allclose(_images(mis=heuristic), _images(mis=nested), rtol=1e-5)
 
 
-def test_power_is_what_path_does_and_other_words_are_not() -> None:
+def test_only_the_power_heuristic_gives_the_image_of_path() -> None:
     images = {word: _images(mis=word) for word in HEURISTICS}
     np.testing.assert_allclose(_images(), images["power"], rtol=1e-5)
     for word in HEURISTICS[1:]:

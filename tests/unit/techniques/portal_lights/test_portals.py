@@ -1,4 +1,5 @@
-"""Portals: what is seen through them, from everywhere, with exact densities; the mean of path."""
+"""Portals: directions through them have exact densities everywhere, and the mean agrees with
+path."""
 
 from __future__ import annotations
 
@@ -76,7 +77,7 @@ def test_no_ray_meets_a_portal_and_it_spoils_no_bounds():
     (np.diag([0, 1, 1, 1]), "keep an area"),
     ([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "become a rectangle"),
 ])  # fmt: skip
-def test_what_is_no_rectangle_is_refused(transform, message):
+def test_portals_that_are_no_rectangles_are_refused(transform, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "portal", "to_world": T(np.array(transform, dtype=np.float64))})
 
@@ -101,7 +102,7 @@ _PAIRS = [("turned", point) for point in _POINTS] + [
     for pair in _PAIRS
 ])  # fmt: skip
 def test_directions_are_distributed_by_the_density(environment: str, point: str) -> None:
-    """Of one portal: the density that a sample has is found again, and chi²."""
+    """With one portal, the density of a sample is found again, and chi² is met."""
     found_portals = portals(scene := _scene(environment))
     maps = PortalMaps(scene, found_portals)
     p = mi.Point3f(*_POINTS[point])

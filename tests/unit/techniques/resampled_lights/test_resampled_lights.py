@@ -1,4 +1,4 @@
-"""Resampled importance sampling: candidates of connections, and what is chosen among them."""
+"""Resampled importance sampling: candidates of connections, and the choice among them."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _estimates(decision, scene, si, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("candidates", [1, 2, 9])
 @pytest.mark.parametrize("bsdf", _BSDFS)
 def test_the_chosen_candidate_stands_for_all(bsdf: str, candidates: int) -> None:
-    """Without MIS: the mean is that of single light samples."""
+    """Without MIS, the mean agrees with single light samples."""
     scene = _scene(_BSDFS[bsdf])
     si = _vertex(scene)
     plain = np.concatenate([_estimates(EmitterSampling(), scene, si, s) for s in range(1, 5)])
@@ -98,7 +98,7 @@ def test_the_density_of_a_direction_is_the_same_when_a_bsdf_sample_finds_it() ->
     assert np.mean(np.abs(ratio - 1) > 1e-2) < 1e-3
 
 
-def test_surfaces_below_the_horizon_bring_nothing() -> None:
+def test_a_surface_that_faces_away_gets_no_connection() -> None:
     """All candidates have the weight 0."""
     scene = _scene(_BSDFS["diffuse"])
     si = _vertex(scene)

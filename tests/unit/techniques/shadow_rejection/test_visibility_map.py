@@ -1,4 +1,4 @@
-"""The visibility map: which voxels are occupied, what is counted, what is made of it."""
+"""The visibility map: occupied voxels, counts, and the probabilities from them."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_entries_are_symmetric_and_their_numbers_invertible():
     assert bool(dr.all((a[0] == b[0]) & a[1] & b[1]))
 
 
-def test_what_was_counted_becomes_the_table_and_the_roulette():
+def test_counts_become_the_table_and_the_roulette():
     """Ninety tests across the wall fail, ninety within the left cube succeed."""
     visibility = VisibilityMap(_scene(), 8, 2**24)
     p = _points([-1.9, 0.1, 0.98])
@@ -139,7 +139,7 @@ def test_what_was_counted_becomes_the_table_and_the_roulette():
     assert float(paper.probability((), (), si, ds, mi.Bool(True))[0][0]) == pytest.approx(1e-4)
 
 
-def test_refinement_tests_what_lies_between_the_voxels():
+def test_refinement_tests_the_space_between_the_voxels():
     """A success seen by chance between the cubes is corrected by the wall; one within is not."""
     scene = _scene()
     visibility = VisibilityMap(scene, 8, 2**24)

@@ -110,7 +110,7 @@ def test_lights_have_the_probabilities_of_their_map() -> None:
     assert probability[1] == 0 and (probability[[0, 2, 3, 4]] > 0).all()
 
 
-def test_pixels_of_a_film_with_a_border_are_those_of_the_image() -> None:
+def test_pixels_of_a_film_with_a_border_are_numbered_as_in_the_image() -> None:
     film = {"sample_border": True, "rfilter": {"type": "gaussian"}}
     border = _sensor(**film).film().rfilter().border_size()
     assert border == 2
@@ -121,7 +121,7 @@ def test_pixels_of_a_film_with_a_border_are_those_of_the_image() -> None:
     assert found.tile == (2, -2, 6, 2)
 
 
-def test_what_is_not_used_is_missing_and_pixels_are_checked() -> None:
+def test_unused_maps_are_missing_and_pixels_are_checked() -> None:
     learner = _LEARNERS["line"]()
     learner.decision.maps = None
     others = {"time": learner, "next_event": SimpleNamespace()}

@@ -79,7 +79,7 @@ def _streaks(width: int = 24, height: int = 18, **changes: Any) -> mi.Scene:
 @pytest.mark.parametrize("variant", [
     "llvm_ad_rgb", pytest.param("llvm_ad_spectral", marks=pytest.mark.slow),
 ], indirect=True)  # fmt: skip
-def test_mean_is_that_of_uniform_numbers(variant: str) -> None:
+def test_mean_agrees_with_uniform_numbers(variant: str) -> None:
     scene = _streaks()
     plain = mi.load_dict({"type": "composed_path", "max_depth": 4})
     expected = batches(scene, plain, 512, [1001, 1002])
@@ -165,7 +165,7 @@ def test_mean_where_the_first_sample_is_divided(monkeypatch) -> None:
     assert abs(images.mean() - expected.mean()) < 4 * error
 
 
-def test_what_is_learned_can_be_saved(tmp_path) -> None:
+def test_learned_maps_can_be_saved(tmp_path) -> None:
     scene, path = _streaks(), str(tmp_path / "maps.npz")
     learning = swarm(always_use=True, save_learned=path)
     first = batches(scene, learning, 64, [1])
@@ -228,7 +228,7 @@ def test_mean_with_maps_along_the_path(only: str) -> None:
     assert "uniform" not in learned
 
 
-def test_records_of_bounces_know_what_comes_before_and_after() -> None:
+def test_records_of_bounces_know_the_path_before_and_after() -> None:
     records = BounceRecords(2, 3)
     # Path 0 chooses at bounces 0 and 2, path 1 at bounce 1
     values = mi.Float([5, 9, 7, 4, 3, 8])

@@ -1,4 +1,4 @@
-"""Maps of numbers that tiles of pixels share: densities over cells, estimates, stages."""
+"""Maps of numbers that tiles of pixels share: their densities, estimates and stages."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_samples_have_their_density(name: str, kind: str) -> None:
     table = dr.full(mi.UInt32, 1, count)
     drawn, pdf, cell = maps.sample(table, u)
     assert all((0 <= x.numpy()).all() and (x.numpy() < 1).all() for x in drawn)
-    # Where a number lies is its cell, but for rounding at the edges
+    # A number lies in its cell, except for rounding at the edges
     assert (cells.find(drawn).numpy() == cell.numpy()).mean() > 0.999
     np.testing.assert_allclose(maps.density(table, cell).numpy(), pdf.numpy(), rtol=1e-3)
     expected = mass[1] * count
@@ -82,7 +82,7 @@ def test_inactive_lanes_keep_their_numbers() -> None:
 def _estimated(
     counts: np.ndarray, widths: np.ndarray | None = None, squares: np.ndarray | None = None
 ) -> np.ndarray:
-    """Of counts by row, column, map and cell; the samples count one each by default."""
+    """Estimates from counts by row, column, map and cell; by default, each sample counts one."""
     widths = np.full(counts.shape[-1], 1 / counts.shape[-1]) if widths is None else widths
     squares = counts.sum(-1) if squares is None else squares
     arrays = (mi.Float(x.astype(np.float32).ravel()) for x in (counts, squares))
@@ -101,7 +101,7 @@ def test_without_samples_maps_are_uniform() -> None:
         np.testing.assert_allclose(tables.expected_ratio(form).numpy(), 1, rtol=1e-5)
 
 
-def test_one_sample_is_not_believed() -> None:
+def test_one_sample_changes_no_density() -> None:
     counts = np.zeros((4, 4, 1, 16))
     counts[1, 2, 0, 5] = 1e9
     shares = _estimated(counts, squares=np.square(counts.sum(-1)))
@@ -124,7 +124,7 @@ def _believed(h, p, n, variance, tables):
     return left, (1 - believed) ** 2 * variance + left * (1 - left) * most / (n * most + 1)
 
 
-def test_few_samples_of_a_tile_are_believed_a_little() -> None:
+def test_few_samples_of_a_tile_have_a_small_influence() -> None:
     counts = np.zeros((1, 2, 1, 2))
     counts[0, 0, 0], counts[0, 1, 0] = (12, 0), (4, 8)
     film, variance = _believed(np.array([2 / 3]), 1 / 2, 24, 0, 1)
@@ -134,7 +134,7 @@ def test_few_samples_of_a_tile_are_believed_a_little() -> None:
     assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.03).all()
 
 
-def test_smaller_tiles_go_on_with_what_larger_ones_have_counted() -> None:
+def test_smaller_tiles_continue_the_counts_of_larger_tiles() -> None:
     tiles, smaller = FilmTiles(7, 5, 4), FilmTiles(7, 5, 2)
     counts, pixel = TileCounts(tiles, 2, 4), dr.arange(mi.UInt32, 35)
     radiance = mi.Float(pixel % 3)

@@ -58,7 +58,7 @@ def test_shares_are_sums_of_texels(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_table_of_a_large_map_needs_96_mib() -> None:
-    """Of 4096 x 2048 texels: 12 bytes each."""
+    """The map has 4096 x 2048 texels, with 12 bytes each."""
     pixels = np.random.default_rng(4).random((2048, 4096, 3), dtype=np.float32)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
     scene = mi.load_dict({"type": "scene", "e": sky, "ball": {"type": "sphere"}})
@@ -145,7 +145,7 @@ def _connections(
 def test_directions_follow_the_product_of_light_and_bsdf(
     environment: str, bsdf: str, gain: float
 ) -> None:
-    """The mean is that of light samples, the noise is lower."""
+    """The mean agrees with light samples, and the noise is lower."""
     scene = floor_below(environment, bsdf)
     si = floor_vertex(scene)
     two_stage = _connections(TwoStage(scene, 16, False), scene, si)

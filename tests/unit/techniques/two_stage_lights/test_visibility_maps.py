@@ -1,4 +1,4 @@
-"""Learned visibility of an environment: densities are exact, the mean is that of path."""
+"""Learned visibility of an environment: densities are exact, and the mean agrees with ``path``."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_visibility_is_a_probability_and_follows_the_counts() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_numbers_are_distributed_by_their_density(kind: str) -> None:
-    """Of one tile: chi² over cells, the density is found again, and no cell is starved."""
+    """In one tile, chi² over cells is met, the density is found again, and no cell is starved."""
     counts = VisibilityCounts(WIDTH, HEIGHT, 16, 16)
     counts.restore(StoredArrays.of({"counts": _counts(kind, (16, 16))}))
     maps, numbers = PrimaryVisibility(counts, 0.8), mi.PCG32(size=LANES)
@@ -220,7 +220,7 @@ def test_without_pilots_it_is_two_stage() -> None:
     np.testing.assert_allclose(plain, same, rtol=1e-5)
 
 
-def test_what_was_learned_is_summed_up_and_kept_over_passes() -> None:
+def test_learned_visibility_is_summed_up_over_passes() -> None:
     integrator = _made("primary", pilot_spp=2)
     batches(_box(), integrator, 8, [1])
     assert "2 x 2 tiles of 8 pixels, 16 x 16 cells" in integrator.statistics.learned
@@ -230,7 +230,7 @@ def test_what_was_learned_is_summed_up_and_kept_over_passes() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("space", ["primary", "world"])
-def test_restored_maps_are_those_that_were_saved(space: str, tmp_path: Path) -> None:
+def test_restored_maps_equal_the_saved_ones(space: str, tmp_path: Path) -> None:
     """Two renders from the same file are equal bit by bit, and better than without maps."""
     scene, file = _box(), str(tmp_path / "learned.npz")
     batches(scene, _made(space, save_learned=file), 64, [1])

@@ -1,4 +1,4 @@
-"""Many connections of the first vertex: unbiased, and more efficient in soft shadows."""
+"""Many connections of the first vertex are unbiased, and more efficient in soft shadows."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def reference() -> np.ndarray:
     ("independent", "none", 1), ("independent", "torus", 3), ("independent", "unbiased", 5),
     ("stratified", "unbiased", 4), ("sobol", "torus", 8), ("lattice", "unbiased", 16),
 ])  # fmt: skip
-def test_mean_is_that_of_path(reference, pattern, weights, count):
+def test_mean_agrees_with_path(reference, pattern, weights, count):
     integrator = direct(3, pattern=pattern, weights=weights, light_samples=count)
     assert_same_pixels_on_average(two_halves(_box(), integrator, 512, SEEDS), reference, 0.01)
 
@@ -83,7 +83,7 @@ def test_light_samples_are_counted() -> None:
     assert rays["shadow"] > 3 * rays["camera"]
 
 
-def test_camera_samples_are_those_of_the_call_then_the_parameter_then_the_sampler() -> None:
+def test_camera_samples_are_counted_by_the_call_then_the_parameter_then_the_sampler() -> None:
     camera = sensor(film=film(4, 4))
     camera["sampler"] = {"type": "independent", "sample_count": 9}
     scene = mi.load_dict(stage(camera=camera))

@@ -1,4 +1,5 @@
-"""Weighted points of the aperture: unbiased, whole sets, less noise from defocus."""
+"""Weighted points of the aperture are unbiased, come in whole sets, and lower the noise of
+defocus."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ def thin_lens(**parameters: Any) -> dict[str, Any]:
 
 
 def bokeh(**parameters: Any) -> mi.Scene:
-    """Small lamps far out of focus: all of the noise is that of the lens."""
+    """Small lamps far out of focus: all noise comes from the lens."""
     lamps = {
         f"lamp_{i}": {
             "type": "sphere", "center": [x, 0, z], "radius": 0.2, "emitter": area(5.0 + i),
@@ -59,7 +60,7 @@ def _reference() -> np.ndarray:
     ("independent", "none"), ("independent", "torus"), ("independent", "unbiased"),
     ("stratified", "unbiased"), ("sobol", "torus"), ("lattice", "none"), ("halton", "unbiased"),
 ])  # fmt: skip
-def test_mean_is_that_of_the_nested_integrator(pattern, weights):
+def test_mean_agrees_with_the_nested_integrator(pattern, weights):
     """With few samples, where weights differ most."""
     images = batches(bokeh(film=WIDE), lens(pattern=pattern, weights=weights), 7, [1, 2])
     assert_same_pixels_on_average(images, _reference(), 0.02, tile=24, unit=4)

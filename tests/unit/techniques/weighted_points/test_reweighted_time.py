@@ -1,4 +1,4 @@
-"""Weighted times of the shutter interval: unbiased, less noise from motion."""
+"""Weighted times of the shutter interval are unbiased, and lower the noise of motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def camera(kind: str = "perspective", **parameters: Any) -> dict[str, Any]:
 
 
 def streaks(**parameters: Any) -> mi.Scene:
-    """Black balls that fly before a bright sky: all of the noise is that of time."""
+    """Black balls that fly before a bright sky: all noise comes from the time."""
     black = {"type": "diffuse", "reflectance": 0.0}
     balls = {
         f"ball_{i}": {
@@ -55,7 +55,7 @@ def _reference() -> np.ndarray:
     ("independent", "none"), ("independent", "torus"), ("independent", "unbiased"),
     ("stratified", "unbiased"), ("sobol", "torus"), ("lattice", "none"),
 ])  # fmt: skip
-def test_mean_is_that_of_the_nested_integrator(pattern, weights):
+def test_mean_agrees_with_the_nested_integrator(pattern, weights):
     """With few samples, where weights differ most."""
     assert 0.3 < _reference().mean() < 0.95
     images = batches(streaks(film=film(64, 64)), timed(pattern=pattern, weights=weights), 7, [1, 2])

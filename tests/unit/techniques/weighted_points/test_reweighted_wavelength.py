@@ -1,4 +1,4 @@
-"""Weighted wavelengths: unbiased, less coloured noise."""
+"""Weighted wavelengths are unbiased, and lower the coloured noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def coloured(nested: dict | None = PATH, **parameters: Any) -> mi.Integrator:
 
 
 def grey_sky(size: int = 16, **parameters: Any) -> mi.Scene:
-    """All of the noise is that of wavelengths."""
+    """All noise comes from the wavelengths."""
     sky = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
     camera = sensor(film=film(size, size, **parameters))
     return mi.load_dict({"type": "scene", "sensor": camera, "sky": sky})
@@ -57,7 +57,7 @@ def _reference(scene: str) -> np.ndarray:
     ("lattice", "torus"), ("lattice", "none"), ("sobol", "none"),
 ])  # fmt: skip
 @pytest.mark.parametrize("scene", SCENES)
-def test_mean_is_that_of_the_nested_integrator(variant, scene, pattern, weights):
+def test_mean_agrees_with_the_nested_integrator(variant, scene, pattern, weights):
     """With few samples, where weights differ most; with and without dispersion."""
     make, nested = SCENES[scene]
     images = batches(make(64), coloured(nested, pattern=pattern, weights=weights), 7, [1, 2])
@@ -87,7 +87,7 @@ def test_sets_lower_the_noise_of_colours(variant, scene, pattern, weights, facto
     assert factor * weighted < plain, f"{plain / weighted:.2f} times less noise"
 
 
-def test_where_one_wavelength_is_left_it_has_the_weight_of_the_whole_circle(variant) -> None:
+def test_a_single_wavelength_has_the_weight_of_the_whole_circle(variant) -> None:
     """Behind a plate of glass every path is refracted, but hardly bent: cells modulo 1/4 would
     leave the noise of independent numbers."""
     spectrum = {"type": "irregular", "wavelengths": "400, 550, 700", "values": "0, 1, 0"}

@@ -1,4 +1,4 @@
-"""Weighted lens points, times and wavelengths combined, and around integrators that learn."""
+"""Weighted lens points, times and wavelengths, combined and around integrators that learn."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def _drawn(sets: WeightedSets, users: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Whole sets of so many users: points [user, N, D], and weights [user, N]."""
+    """Whole sets for each user: points [user, N, D], and weights [user, N]."""
     rng = np.random.default_rng(seed)
     number = sets.choose(mi.Float(np.repeat(rng.random(users, np.float32), sets.count)))
     shift = mi.Point2f(np.repeat(rng.random((2, users), np.float32), sets.count, axis=1))
@@ -76,7 +76,7 @@ def test_all_sets_are_used_alike() -> None:
     assert sets.choose(mi.Float(np.nextafter(np.float32(1), np.float32(0)))).numpy() == 31
 
 
-def test_weights_are_those_of_the_points_that_are_drawn() -> None:
+def test_weights_belong_to_the_points_that_are_drawn() -> None:
     for kind, boundary in (("voronoi", "clip"), ("torus", "torus")):
         u, weight = _drawn(WeightedSets("independent", kind, 8, 2, seed=1), 5)
         for x, w in zip(u, weight):
@@ -90,13 +90,14 @@ def test_only_voronoi_points_stay_where_they_are() -> None:
 
 
 def test_the_order_of_points_is_random() -> None:
-    """The order of the points must not be correlated with that of samplers or of other sets."""
+    """The order of the points must not be correlated with the order of samplers or of other
+    sets."""
     u, _ = _drawn(WeightedSets("lattice", "voronoi", 64, 1, seed=1), 50)
     first = u[:, :8, 0].mean(axis=1)
     assert abs(first.mean() - 0.5) < 0.1 and first.std() > 0.05
 
 
-def test_a_second_weight_is_that_of_places_modulo_a_period() -> None:
+def test_a_second_weight_belongs_to_places_modulo_a_period() -> None:
     sets = WeightedSets("independent", "torus", 12, 1, seed=3, periods=4)
     index, zero = dr.arange(mi.UInt32, 12), dr.zeros(mi.UInt32, 12)
     u, weight, folded = sets.draw(zero, mi.Point2f(0.3), index, mi.Bool(True))
