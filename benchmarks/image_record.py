@@ -98,9 +98,9 @@ def write(file: Path, scenes: tuple[str, ...], integrators: tuple[str, ...]) -> 
                 continue
             command = [sys.executable, __file__, "one", scene, integrator]
             done = subprocess.run(command, capture_output=True, text=True)
-            # Mitsuba's log is there as well
-            lines = [line for line in done.stdout.splitlines() if line.startswith('[{"')]
-            result = json.loads(lines[-1]) if lines else [{"died": done.stderr[-500:]}]
+            # Mitsuba's log, which may colour the line, is there as well
+            _log, is_found, text = done.stdout.rpartition('[{"')
+            result = json.loads(is_found + text) if is_found else [{"died": done.stderr[-500:]}]
             found[f"{scene} {integrator}"] = result
             file.write_text(json.dumps(found, indent=1))
             print(scene, integrator, result[0].get("mean", result[0]), flush=True)
