@@ -19,8 +19,8 @@ _BOUNCES, _MOST_PATHS = 12, 1 << 18
 BYTES_PER_PATH = 4 * (4 * _BOUNCES + 1)
 
 
-class Effect(NamedTuple):
-    """The effect of a way to draw paths.
+class Outcome(NamedTuple):
+    """What a way to draw paths gives.
 
     Attributes:
         variance: Sum over the paths of their squared errors, weighted by pixel.
@@ -30,7 +30,7 @@ class Effect(NamedTuple):
     variance: float
     segments: float
 
-    def efficiency(self, other: Effect) -> float:
+    def efficiency(self, other: Outcome) -> float:
         """The efficiency, relative to ``other``."""
         return other.variance * other.segments / max(self.variance * self.segments, 1e-30)
 
@@ -61,7 +61,7 @@ class RouletteTrial(Observer):
 
     def restart(self) -> None:
         """Sets the effects to zero: they then refer to later paths only."""
-        self.drawn = self.by_throughput = self.unguided = Effect(0.0, 0.0)
+        self.drawn = self.by_throughput = self.unguided = Outcome(0.0, 0.0)
 
     def kernel_state(self) -> tuple:
         """The attributes on which kernels depend (``frozen.py``)."""
@@ -121,9 +121,9 @@ class RouletteTrial(Observer):
         # Evaluated together: each of them alone would be a kernel of its own
         dr.eval(columns)
         error, *sums = (float(dr.sum(x)[0]) for x in columns)
-        effects = [Effect(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
+        effects = [Outcome(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
         self.drawn, self.by_throughput, self.unguided = (
-            Effect(*(x + y for x, y in zip(old, new)))
+            Outcome(*(x + y for x, y in zip(old, new)))
             for old, new in zip((self.drawn, self.by_throughput, self.unguided), effects)
         )
         self._paths = 0

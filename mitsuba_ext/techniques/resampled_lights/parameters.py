@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...planning.costs import CANDIDATES_PER_PATH
 from ...planning.technique import ParameterReader, Setting, Technique
 from .resampled_lights import ResampledLights
-
-#: Number of candidates that take about as long as a path.
-_CANDIDATES_PER_PATH = 32
 
 
 class ResampledLightsChoice(Technique):
@@ -25,7 +23,7 @@ class ResampledLightsChoice(Technique):
 
     @property
     def sample_cost(self) -> int:
-        return 1 + self.candidates // _CANDIDATES_PER_PATH
+        return 1 + self.candidates // CANDIDATES_PER_PATH
 
     def decision(self, setting: Setting) -> Any | None:
         if not setting.scene.emitters():

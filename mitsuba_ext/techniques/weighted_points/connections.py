@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...planning.costs import CONNECTIONS_PER_PATH
 from ...planning.technique import ParameterReader, Setting, Technique
 from ...util.pointsets import PATTERNS
 from .weighted_connections import NoFirstConnections, WeightedConnections
@@ -11,9 +12,6 @@ from .weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
 
 #: The most connections of a vertex.
 _MOST = 4096
-
-#: Number of connections that take about as long as a path.
-_PER_PATH = 16
 
 
 class Connections(Technique):
@@ -42,7 +40,7 @@ class Connections(Technique):
 
     @property
     def sample_cost(self) -> int:
-        return max(1, self.count // _PER_PATH)
+        return max(1, self.count // CONNECTIONS_PER_PATH)
 
     def decision(self, setting: Setting) -> Any | None:
         if not setting.scene.emitters() or setting.max_depth < 2:

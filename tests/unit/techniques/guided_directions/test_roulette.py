@@ -13,7 +13,7 @@ import pytest
 
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
 from mitsuba_ext.techniques.guided_directions.adjoint_roulette import AdjointRoulette
-from mitsuba_ext.techniques.guided_directions.roulette_trial import Effect, RouletteTrial
+from mitsuba_ext.techniques.guided_directions.roulette_trial import Outcome, RouletteTrial
 from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
 from mitsuba_ext.transport.path_decisions import Roulette
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor
@@ -158,14 +158,14 @@ def test_the_effects_of_other_roulettes_are_estimated_too(survival: float) -> No
     squares = {"drawn": 4 * 0.5 * 0.6 / survival**2, "by_throughput": 4 * 0.5 * 0.6 / 0.64,
                "unguided": 4 * 0.5 / 0.64}  # fmt: skip
     for name, square in squares.items():
-        effect: Effect = getattr(trial, name)
+        effect: Outcome = getattr(trial, name)
         p = survival if name == "drawn" else 0.8
         assert effect.variance / lanes == pytest.approx(square - 1, rel=0.08), name
         assert effect.segments / lanes == pytest.approx(1 + p + p * p, rel=0.02), name
 
 
 def test_efficiency_counts_variance_and_segments() -> None:
-    assert Effect(1.0, 2.0).efficiency(Effect(4.0, 1.0)) == 2
+    assert Outcome(1.0, 2.0).efficiency(Outcome(4.0, 1.0)) == 2
 
 
 # ---- Renders ----
@@ -221,7 +221,7 @@ def test_learned_roulette_is_dropped_where_the_one_of_path_is_better(monkeypatch
 
     def worse(self) -> None:
         finish(self)
-        self.drawn = Effect(2 * self.by_throughput.variance, self.by_throughput.segments)
+        self.drawn = Outcome(2 * self.by_throughput.variance, self.by_throughput.segments)
 
     monkeypatch.setattr(RouletteTrial, "finish", worse)
     scene = _lamp_to_the_ceiling()
