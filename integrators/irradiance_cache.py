@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -19,7 +18,7 @@ from mitsuba_ext.estimators.caches.hemisphere import Strata
 from mitsuba_ext.estimators.caches.irradiance_rounds import CacheParameters, CacheRounds, deadline
 from mitsuba_ext.estimators.caches.record_grid import RecordGrid
 from mitsuba_ext.estimators.caches.records import Records
-from mitsuba_ext.planning import learned_file
+from mitsuba_ext.planning.learned_file import LearnedFile
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
@@ -225,29 +224,29 @@ class IrradianceCache(WalkIntegrator):
             scene, inner, strata, parameters.bounds,
             self.min_spacing, self.max_share, self._seed,
         )  # fmt: skip
-        known = self._read(scene)
+        file = self._file(scene)
+        known = self._known(file)
         most = int(self.effort * self._samples / strata.count)
         rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, self._seed, known, most)
         rounds.run(deadline(0.5 * self.timeout, self._begin))
         self.records, self.rounds = rounds.records, rounds.rounds
-        if self.cache_file and len(self.records) > len(known):
-            arrays = {"records": self.records.arrays()}
-            learned_file.save(Path(self.cache_file), scene, self._made_by(), arrays)
+        if file is not None and len(self.records) > len(known):
+            file.save({"records": self.records.arrays()})
         return rounds.final_grid()
 
-    def _read(self, scene: mi.Scene) -> Records:
+    def _file(self, scene: mi.Scene) -> LearnedFile | None:
         if self.cache_file:
             self.check_target("cache_file", self.cache_file)
-        if not self.cache_file or not Path(self.cache_file).exists():
-            return Records.none(len(mi.Spectrum()))
-        where = f'"{self.name}": the parameter "cache_file"'
-        arrays = learned_file.read(Path(self.cache_file), scene, self._made_by(), where)
-        return Records.of_arrays(arrays.part("records/"), len(mi.Spectrum()))
-
-    def _made_by(self) -> str:
-        """The parameters on which records depend."""
         shown = {**self.common_parameters(), **self.parameters()}
-        return ", ".join(f"{key} = {shown[key]}" for key in _OF_RECORDS) + f" ({mi.variant()})"
+        made_by = ", ".join(f"{key} = {shown[key]}" for key in _OF_RECORDS)
+        return self.file_of("cache_file", scene, f"{made_by} ({mi.variant()})")
+
+    def _known(self, file: LearnedFile | None) -> Records:
+        """The records of earlier renders."""
+        stored, channels = file.load() if file else None, len(mi.Spectrum())
+        if stored is None:
+            return Records.none(channels)
+        return Records.of_arrays(stored.part("records/"), channels)
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         image = super().render_once(scene, sensor, seed, spp, develop, evaluate)

@@ -22,8 +22,6 @@ _CONDITIONS = {
     "law": _REJECTING,
     "slope": f"{_REJECTING} by the affine law",
     "floor": f"{_REJECTING} by the affine law",
-    "load_map": _LEARNING,
-    "save_map": _LEARNING,
 }
 
 
@@ -72,7 +70,8 @@ class NEEPlusPlus(WalkIntegrator):
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
          :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
-         scene, with the same parameters and film size, has saved. (Default: none)
+         scene, with the same parameters and film size, has saved, even from another camera.
+         (Default: none)
      * - keep_learned
        - |bool|
        - Whether to keep what is learned for later renders of this process (frames, notebooks). A
@@ -87,10 +86,6 @@ class NEEPlusPlus(WalkIntegrator):
        - |int|
        - With :monosp:`rejection`, and only if light sampling is not learned: the number of random
          visibility tests of :monosp:`visibility_roulette`. (Default: 16)
-     * - save_map, load_map
-       - |string|
-       - If :monosp:`light_sampling` is learned: the file to which the map is saved, and the file
-         from which an initial map is loaded. (Default: none)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -103,8 +98,8 @@ class NEEPlusPlus(WalkIntegrator):
 
     A first sample per pixel, which is not added to the film, finds the surfaces and the region in
     which paths scatter. Each pilot except the first chooses its lights by what the earlier pilots
-    have learned. If these show that the gain is small, learning ends early, unless :monosp:`grid`,
-    :monosp:`rejection` or a map file is given.
+    have learned. If these show that the gain is small, learning ends early, unless
+    :monosp:`grid` or :monosp:`rejection` is given.
 
     Participating media are rendered as in :monosp:`volpath`; lights are learned for points in media
     as they are for surfaces (:monosp:`light_sampling=linear` refuses media). Gradients are not

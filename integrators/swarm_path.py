@@ -80,7 +80,8 @@ class SwarmPath(WalkIntegrator):
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
          :monosp:`load_learned`, it takes no pilot samples, but uses what a render of the same
-         scene, with the same parameters and film size, has saved. (Default: none)
+         scene, with the same parameters and film size, has saved, even from another camera.
+         (Default: none)
      * - keep_learned
        - |bool|
        - Whether to keep what is learned for later renders of this process (frames, notebooks). A

@@ -35,13 +35,6 @@ class LearnedLightsPlugin(DecisionPlugin):
        - |float|
        - Memory for what is learned, in MiB. If :monosp:`grid` needs more, a coarser grid is used,
          with a warning. (Default: 512)
-     * - save_map
-       - |string|
-       - File to which the learned map is saved; its folder must exist. (Default: none)
-     * - load_map
-       - |string|
-       - File from which an initial map is loaded, learned from this view of the scene or from
-         another one; the pilots add to it. A map of another scene is refused. (Default: none)
 
     **Use it when** there are many lights, when most lights are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
@@ -54,8 +47,9 @@ class LearnedLightsPlugin(DecisionPlugin):
     samples, so the image is unbiased. A tenth of the choices do not depend on what was learned. The
     second and third pilots measure how much lower the variance of the image is than with the choice
     of :monosp:`path`. If the reduction is less than about 15 %, the table is not worth the time of
-    its look-ups, and learning ends, unless :monosp:`grid`, a map file, or also a
-    :monosp:`visibility_roulette` is given.
+    its look-ups, and learning ends, unless :monosp:`grid` or also a :monosp:`visibility_roulette`
+    is given. The integrator saves the map with everything else that it has learned
+    (:monosp:`save_learned`).
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
     :monosp:`path` is biased for these lights, because of a fault in Mitsuba. Nested in

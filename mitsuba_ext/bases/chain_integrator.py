@@ -7,22 +7,22 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..estimators.chains.chain_file import ChainFile
 from ..estimators.chains.path_target import PathTarget
 from ..estimators.chains.render import ChainRender
 from ..estimators.chains.target import ImageTarget
+from ..planning.learned_file import LearnedFile
 from ..planning.technique import Setting, decisions_of
 from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt, interrupted
 from ..rendering.stages import OneStage
+from ..scene.fingerprint import sensor_digest
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator, Sample
@@ -113,7 +113,7 @@ class ChainIntegrator(WalkIntegrator):
         :class:`ChainRender` after the integrator."""
         raise NotImplementedError
 
-    def state_file(self, target: ImageTarget | PathTarget, seed: int) -> ChainFile | None:
+    def state_file(self, target: ImageTarget | PathTarget, seed: int) -> LearnedFile | None:
         """The file for the state of a render; ``None`` without the parameter ``chain_file``.
 
         Raises:
@@ -122,14 +122,15 @@ class ChainIntegrator(WalkIntegrator):
         if not self.chain_file:
             return None
         self.check_target("chain_file", self.chain_file)
-        parameters = {
+        sensor, film = target.sensor, target.sensor.film()
+        made_by = {
             **self.parameters(), "chain_file": "", "max_depth": self.max_depth,
-            "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
+            "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters, "seed": seed,
+            "variant": mi.variant(), "size": film.crop_size(), "offset": film.crop_offset(),
+            "filter": film.rfilter(), "sensor": sensor_digest(sensor),
         }  # fmt: skip
-        where = f'"{self.name}": the parameter "chain_file"'
-        return ChainFile(
-            Path(self.chain_file), target.scene, target.sensor, seed, parameters, where
-        )
+        described = (f"{key} = {' '.join(str(value).split())}" for key, value in made_by.items())
+        return self.file_of("chain_file", target.scene, ", ".join(described))
 
     def target(self, setting: Setting) -> ImageTarget | PathTarget | None:
         """The target distribution of the chains; ``None`` if no path is left for them to find."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..planning import kept_learning, learned_file
 from ..planning.costs import LEARNING_KERNELS
+from ..planning.learned_file import LearnedFile
 from ..planning.learner import Learner
 from ..planning.pilots import pilot_samples, stage_weights
 from ..planning.planner import LearningPlan, Planner
@@ -34,6 +35,7 @@ from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
 from ..util.errors import InputError
+from ..util.stored_arrays import StoredArrays
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 
@@ -133,6 +135,13 @@ class WalkIntegrator(StagedIntegrator):
                         f'"{self.name}": with "load_learned" nothing is learned: leave "{key}" out'
                     )
 
+    def file_of(self, key: str, scene: mi.Scene, made_by: str) -> LearnedFile | None:
+        """The file that the parameter ``key`` names; ``None`` if the scene names none. ``made_by``
+        is explained in :class:`LearnedFile`."""
+        if not (file := getattr(self, key)):
+            return None
+        return LearnedFile(Path(file), scene, made_by, f'"{self.name}": the parameter "{key}"')
+
     def parameters(self) -> dict[str, Any]:
         learning = {
             "pilot_spp": self._pilot_spp,
@@ -160,7 +169,7 @@ class WalkIntegrator(StagedIntegrator):
 
     @property
     def can_learn(self) -> bool:
-        """Do ``save_learned`` and ``load_learned`` have an effect?"""
+        """Whether it takes pilots, and can learn something that other renders can load."""
         return bool(self._pilot_spp)
 
     def plan_learning(
@@ -217,7 +226,7 @@ class WalkIntegrator(StagedIntegrator):
     ) -> Planner:  # fmt: skip
         *pilots, _rest = samples
         # A restored state needs no pilots, but learners to restore it: these need a pilot_spp > 0
-        pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 0
+        pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 1
         setting = Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
             self.timeout > 0, self.name, techniques=self.slots,
@@ -237,20 +246,22 @@ class WalkIntegrator(StagedIntegrator):
         width, height = film_extent(sensor.film())
         return ", ".join([*slots, f"film = {width}x{height}"])
 
-    def _loaded(self, scene: mi.Scene, sensor: mi.Sensor) -> learned_file.States:
-        where = f'"{self.name}": the parameter "load_learned"'
-        return learned_file.load(
-            Path(self.load_learned), scene, self._learned_by(sensor), where
-        )
+    def _loaded(self, scene: mi.Scene, sensor: mi.Sensor) -> dict[str, StoredArrays]:
+        file = self.file_of("load_learned", scene, self._learned_by(sensor))
+        if (stored := file.load()) is None:
+            raise FileNotFoundError(
+                f'{file.where} names "{file.path}", which does not exist: give it a file that '
+                f'"save_learned" wrote'
+            )
+        return stored.parts()
 
     def _savers(
         self, scene: mi.Scene, sensor: mi.Sensor, pilot_spp: int
     ) -> list[Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]]:
         """The functions that save what is learned, in a file and for this process."""
         made_by, savers = self._learned_by(sensor), []
-        if self.save_learned:
-            path = Path(self.save_learned)
-            savers.append(functools.partial(learned_file.save, path, scene, made_by))
+        if file := self.file_of("save_learned", scene, made_by):
+            savers.append(file.save)
         if self.keep_learned and pilot_spp:
             savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
         return savers

@@ -1,8 +1,10 @@
-"""Files with everything that a render has learned."""
+"""The files that keep what a render has found for later renders of its scene: learned decisions,
+records of irradiance, and the state of Markov chains."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,68 +20,62 @@ FORM = "mitsuba_ext learned 3"
 #: The most characters of the descriptions that files hold.
 _LONGEST = 1 << 16
 
-#: For each slot, the arrays from which the decision of the last stage is made.
-States = dict[str, StoredArrays]
-
-
-def save(
-    path: Path, scene: mi.Scene, made_by: str, states: Mapping[str, Mapping[str, np.ndarray]]
-) -> None:
-    """Writes what was learned.
-
-    Parameters:
-        path: The file.
-        scene: The scene for which it was learned.
-        made_by: The parameters of the decisions that learned, and the size of the film.
-        states: For each slot, the result of ``Learner.state``.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    arrays = {
-        f"{slot}/{name}": array for slot, state in states.items() for name, array in state.items()
-    }
-    header = {"scene": np.array(fingerprint(scene)), "made_by": np.array(made_by)}
-    archives.write(path, FORM, {**header, **arrays})
-
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` if :func:`save` cannot make or replace a file."""
+    """Raises :class:`InputError` if :meth:`LearnedFile.save` cannot make or replace a file."""
     archives.check_target(path, FORM)
 
 
-def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
-    """Reads what :func:`save` has written. Parameters and errors: see :func:`read`."""
-    arrays = read(path, scene, made_by, parameter)
-    slots = {name.partition("/")[0] for name in arrays.names if "/" in name}
-    return {slot: arrays.part(f"{slot}/") for slot in slots}
+@dataclass(frozen=True)
+class LearnedFile:
+    """A file with one or several parts: the states of the slots that were learned, ``records``, or
+    ``chains``. The file names the scene and the parameters for which it is valid.
 
-
-def read(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> StoredArrays:
-    """Reads what :func:`save` has written: arrays with the names ``slot/name``.
-
-    Parameters:
-        path, scene, made_by: As for :func:`save`.
-        parameter: The name, in error messages, of the parameter that names the file.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file is of another kind, damaged, or of another scene or other parameters.
-            What was learned is checked when it is taken from the result.
+    Attributes:
+        path: The file, which need not exist.
+        scene: The scene for which it is valid.
+        made_by: The parameters, and whatever else it depends on.
+        where: What error messages begin with: the plugin, and the parameter that names the file.
     """
-    if not path.exists():
-        raise FileNotFoundError(
-            f'{parameter} names "{path}", which does not exist: give it a file that "save_learned" '
-            f"wrote"
-        )
-    origin, remedy = f'{parameter} names "{path}", which', "delete it, and begin again"
-    arrays = archives.read(path, FORM, origin, remedy)
-    if arrays.text("scene") != fingerprint(scene):
-        raise ValueError(
-            f"{origin} belongs to another scene, or this one has changed: {remedy}"
-        )
-    if (found := arrays.text("made_by", _LONGEST)) != made_by:
-        raise ValueError(
-            f"{origin} was made with other parameters: {found} instead of {made_by}"
-        )
-    return arrays
+
+    path: Path
+    scene: mi.Scene
+    made_by: str
+    where: str
+
+    def save(self, parts: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+        """Writes or replaces the file.
+
+        Parameters:
+            parts: The arrays of each part.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        arrays = {
+            f"{part}/{name}": array for part, its in parts.items() for name, array in its.items()
+        }
+        header = {"scene": np.array(fingerprint(self.scene)), "made_by": np.array(self.made_by)}
+        archives.write(self.path, FORM, {**header, **arrays})
+
+    def load(self) -> StoredArrays | None:
+        """What :meth:`save` has written: arrays with the names ``part/name``. Their values are
+        checked when they are taken. ``None`` if the file does not exist.
+
+        Raises:
+            ValueError: The file is of another kind, damaged, or of another scene or other
+                parameters.
+        """
+        if not self.path.exists():
+            return None
+        origin, remedy = f'{self.where} names "{self.path}", which', "delete it, and begin again"
+        arrays = archives.read(self.path, FORM, origin, remedy)
+        if arrays.text("scene") != fingerprint(self.scene):
+            raise ValueError(
+                f"{origin} belongs to another scene, or this one has changed: {remedy}"
+            )
+        if (found := arrays.text("made_by", _LONGEST)) != self.made_by:
+            raise ValueError(
+                f"{origin} was made with other parameters: {found} instead of {self.made_by}"
+            )
+        return arrays

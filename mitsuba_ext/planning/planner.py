@@ -17,9 +17,9 @@ from ..transport.estimator import Estimator
 from ..transport.observer import Observer, Observers
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
+from ..util.stored_arrays import StoredArrays
 from . import verdicts
 from .costs import LIGHT_PATH_KERNELS
-from .learned_file import States
 from .learner import Learner, Pilot
 from .pilots import first_parts, stage_weights
 from .scout import SCOUT_DEPTH, Scout
@@ -48,7 +48,7 @@ class LearningPlan(Learning):
     """
 
     remark: str = ""
-    restore: Callable[[], States] | None = None
+    restore: Callable[[], Mapping[str, StoredArrays]] | None = None
     trial: Callable[[int], Trial] | None = None
     tries: bool = False
 
@@ -299,7 +299,7 @@ class Planner(Schedule):
 
     # ---- The last stage ----
 
-    def _restored_stage(self, states: States) -> Stage:
+    def _restored_stage(self, states: Mapping[str, StoredArrays]) -> Stage:
         for slot, learner in self._everyone.items():
             if slot in states:
                 self.decide(**{slot: learner.restore(self._setting.scene, states[slot])})

@@ -28,3 +28,11 @@ def digest(scene_object: mi.Object) -> bytes:
         state.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value)
                      else repr(value).encode())
     return state.digest()
+
+
+def sensor_digest(sensor: mi.Sensor) -> str:
+    """A hash of a sensor's class, its motion, and the parameters that it exposes by name."""
+    values = mi.traverse(sensor)
+    motion = getattr(sensor, "motion", "")
+    text = "".join(f"{key}={values[key]}" for key in sorted(values.keys()))
+    return hashlib.sha256(f"{sensor.class_name()} {motion} {text}".encode()).hexdigest()[:16]

@@ -16,6 +16,9 @@ from .plugin_folders import KINDS, plugin_files
 if TYPE_CHECKING:
     import mitsuba as mi
 
+#: Parameters of earlier versions, and those that replace them.
+_REPLACED = {"save_map": "save_learned", "load_map": "load_learned"}
+
 
 @functools.cache
 def parameter_rows(name: str) -> list[Parameter]:
@@ -39,6 +42,11 @@ def unread(name: str, key: str, others: Sequence[str] = ()) -> str:
         others: The known parameters of a plugin of another package.
     """
     ours = parameter_names(name)
+    if ours and key in _REPLACED:
+        return (
+            f'"{name}" has no parameter "{key}" any more: give its integrator the parameter '
+            f'"{_REPLACED[key]}" instead'
+        )
     if key in ours:
         return (
             f'"{name}": nothing here uses the parameter "{key}": leave it out '
@@ -66,7 +74,8 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
     if key.startswith("_arg_"):
         raise ValueError(f'"{name}": {_nameless(value)}')
     message = unread(name, key)
-    if hasattr(plugin, "technique") and "did you mean" not in message:
+    is_misspelt = key in _REPLACED or "did you mean" in message
+    if hasattr(plugin, "technique") and not is_misspelt:
         message += f"; it is for nesting in an integrator, with {_names(plugin)}"
     raise ValueError(message)
 

@@ -49,11 +49,6 @@ class StoredArrays:
     def __contains__(self, name: str) -> bool:
         return name in self._headers
 
-    @property
-    def names(self) -> list[str]:
-        """The names of all arrays."""
-        return list(self._headers)
-
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of an array that exists."""
         return self._headers[name].shape
@@ -64,6 +59,11 @@ class StoredArrays:
         return StoredArrays(
             headers, lambda name: self._read(prefix + name), self._origin, self._remedy
         )
+
+    def parts(self) -> dict[str, StoredArrays]:
+        """The arrays with names of the form ``part/name``, by the part and the rest of the name."""
+        parts = {name.partition("/")[0] for name in self._headers if "/" in name}
+        return {part: self.part(f"{part}/") for part in parts}
 
     def take(
         self,

@@ -258,7 +258,7 @@ _WRONG_REJECTION = [
     (ValueError, {"floor": math.nan}),
     (ValueError, {"light_sampling": "spacial"}),
     (TypeError, {"rejection": "yes"}),
-    (TypeError, {"load_map": 3}),
+    (TypeError, {"load_learned": 3}),
 ]
 _WRONG_GUIDING = [
     (ValueError, {"regions": "walls"}),
@@ -275,7 +275,7 @@ WRONG_VALUES = [(name, *wrong) for name in DEFAULTS for wrong in _WRONG]
 # Most of them are known only where shadow rays are rejected, by a map of their own
 _REJECTION = {"light_sampling": "uniform", "rejection": True}
 WRONG_VALUES += [
-    ("neepp", kind, {**wrong, **({} if wrong.keys() & {*_REJECTION, "load_map"} else _REJECTION)})
+    ("neepp", kind, {**wrong, **({} if wrong.keys() & _REJECTION.keys() else _REJECTION)})
     for kind, wrong in _WRONG_REJECTION
 ]
 WRONG_VALUES += [("pss_guided", *wrong) for wrong in _WRONG_GUIDING]

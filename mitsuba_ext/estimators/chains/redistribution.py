@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...planning.learned_file import LearnedFile
 from ...util.stored_arrays import StoredArrays
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -20,7 +21,7 @@ from .noise_filters import FilteredChains, FilteredImage, NoiseFilters
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
-from .stored import Arrays, StateFile
+from .stored import PART, Arrays
 from .target import Found
 
 #: The saved totals over all batches, besides the image.
@@ -59,7 +60,7 @@ class RedistributionSettings:
     luminance_samples: int
     steps: SmallSteps
     filters: NoiseFilters = NoiseFilters()
-    file: StateFile | None = None
+    file: LearnedFile | None = None
 
 
 class RedistributionRender(ChainRender):
@@ -111,7 +112,7 @@ class RedistributionRender(ChainRender):
         deposit = self._spp * first.mean / (settings.mutations or self._spp)
         stored = settings.file.load() if settings.file else None
         if stored:
-            self._restore(stored, image)
+            self._restore(stored.part(f"{PART}/"), image)
         left = max(0, self._spp * self._pixel_count - self._samples)
         is_timed = self._integrator.timeout > 0
         size = min(left, self.max_timed_batch if is_timed else self.max_batch)
@@ -132,7 +133,7 @@ class RedistributionRender(ChainRender):
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
         # Not after an error, when a batch may be half done
         if settings.file:
-            settings.file.save(self._stored(image))
+            settings.file.save({PART: self._stored(image)})
 
     def _stored(self, image: ChainImage) -> Arrays:
         """The sums over completed batches; the next batch takes new samples."""

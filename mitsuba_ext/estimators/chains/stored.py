@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,21 +19,14 @@ from .target import Contribution
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
 
+#: The part of a :class:`~mitsuba_ext.planning.learned_file.LearnedFile` that holds them.
+PART = "chains"
+
 #: The maximum number of elements of an array whose length the reader does not know.
 _MAX_NUMBERS = 1 << 27
 
 #: The minimum and the maximum value of an array or a field, by its name.
 Ranges = Mapping[str, tuple[Any, Any]]
-
-
-class StateFile(Protocol):
-    """A file that holds the state of a render."""
-
-    def load(self) -> StoredArrays | None:
-        """The saved state; ``None`` if none has been saved yet."""
-
-    def save(self, arrays: Arrays) -> None:
-        """Saves a state, which replaces the previous one."""
 
 
 def arrays_of(value: Any, name: str) -> Arrays:

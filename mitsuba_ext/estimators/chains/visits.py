@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...planning.learned_file import LearnedFile
 from ...util.stored_arrays import StoredArrays
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -19,7 +20,7 @@ from .even_tiles import EvenTiles
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
-from .stored import Arrays, StateFile
+from .stored import PART, Arrays
 from .target import Found, ImageTarget
 
 #: For estimators without and with light paths: the minimum and the maximum number of chains, and
@@ -65,7 +66,7 @@ class ChainSettings:
     steps: SmallSteps
     uses_uniform: bool
     is_even: bool = False
-    file: StateFile | None = None
+    file: LearnedFile | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class MetropolisRender(ChainRender):
         stored = file.load() if file else None
         try:
             if stored:
-                chains, start = self._restored(stored, image)
+                chains, start = self._restored(stored.part(f"{PART}/"), image)
             else:
                 chains, start = self._begun(total, image, interrupt)
         except _StoppedError:
@@ -143,7 +144,7 @@ class MetropolisRender(ChainRender):
                 self._write(chains, image, start)
         # Not after an error, when the chains may be amid a launch
         if file:
-            file.save(self._stored(chains, image, start))
+            file.save({PART: self._stored(chains, image, start)})
 
     def _begun(
         self, total: int, image: ChainImage, interrupt: threading.Event

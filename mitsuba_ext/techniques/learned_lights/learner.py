@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +23,7 @@ from ...transport.light_table import LightTable
 from ...transport.observer import Observer
 from ...transport.rejection_law import RejectionLaw
 from ...util.stored_arrays import StoredArrays
-from . import light_map_file
+from . import light_map_arrays
 from .connection_records import ConnectionRecords
 from .light_map import BYTES_PER_ENTRY, LightMap
 from .shadow_roulette_learner import LightMapRouletteLearner
@@ -59,8 +58,6 @@ class LightMapLearner(Learner):
         pilot_samples: Samples of all pilots together.
         film_width: Pixels of a row of the film, with its border where that is sampled.
         render_samples: Samples of the render, pilots included.
-        load, save: Files of a map to begin with, and of the map that was learned.
-        plugin: Name of the plugin in error messages.
 
     Attributes:
         map (LightMap): What has been learned so far; ``None`` if there is no map.
@@ -76,18 +73,12 @@ class LightMapLearner(Learner):
         pilot_samples: int,
         film_width: int,
         render_samples: float = math.inf,
-        load: Path | None = None,
-        save: Path | None = None,
-        plugin: str = "neepp",
     ) -> None:
         self.target, self.grid = target, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
         self.render_samples = render_samples
-        self.load, self.save, self.plugin = load, save, plugin
         self._pixels = PixelEstimates(film_width)
-        # A loaded map contains its region and its rows
-        self.wants_scout = load is None
-        self._is_needed = grid > 0 or load is not None or save is not None
+        self._is_needed = grid > 0
         self.map: LightMap | None = None
         self._records: ConnectionRecords | None = None
         self._summary, self._effect = "", "not measured"
@@ -100,7 +91,7 @@ class LightMapLearner(Learner):
         self._finer_map: Callable[[], LightMap] | None = None
         self._bins: EnvironmentBins | None = None
 
-    tells_visibility = True
+    wants_scout = tells_visibility = True
 
     def shadow_test(self, law: RejectionLaw) -> LightMapRouletteLearner:
         return LightMapRouletteLearner(self, law)
@@ -112,12 +103,7 @@ class LightMapLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightTable | None:
         self.map, self._records, self._bins = None, None, None
         self._summary = "lights: no path scatters"
-        if self.load is not None:
-            self.map = light_map_file.load(
-                self.load, scene, self.pilot_samples, self.max_memory,
-                parameter=f'"{self.plugin}": the parameter "load_map"',
-            )  # fmt: skip
-        elif dr.width(p) > 0:
+        if dr.width(p) > 0:
             self.map = self._first_map(scene, p, n)
             # Mitsuba samples these with a wrong density
             self._is_needed |= self.map.cells.has_smooth_meshes
@@ -223,15 +209,13 @@ class LightMapLearner(Learner):
                 return self._begin_map()
         if pilot.is_last:
             self._is_kept, self._summary = True, f"{self.map}, {self._effect}"
-            if self.save is not None:
-                light_map_file.save(self.save, pilot.scene, self.map)
         return self._selection(probabilities)
 
     def state(self) -> dict[str, np.ndarray]:
-        return {} if self.map is None else light_map_file.arrays_of(self._scene, self.map)
+        return {} if self.map is None else light_map_arrays.arrays_of(self._scene, self.map)
 
     def restore(self, scene: mi.Scene, state: StoredArrays) -> LightTable:
-        self.map = light_map_file.of_arrays(state, scene, self.max_memory)
+        self.map = light_map_arrays.of_arrays(state, scene, self.max_memory)
         self._set_as_path(scene)
         self.map.evaluate()
         self._is_kept, self._summary = True, str(self.map)

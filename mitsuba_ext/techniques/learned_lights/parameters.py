@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -11,9 +10,6 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Slots, Technique
 from ...rendering.camera import film_extent
-from ...util import archives
-from ...util.errors import InputError
-from . import light_map_file
 from .learner import LightMapLearner
 
 #: What the map of :class:`LearnedLights` can learn of each light, the default first.
@@ -37,30 +33,12 @@ class LearnedLights(Technique):
         self.target = target or read("target", TARGETS[0], choices=TARGETS)
         self.grid = read.optional_count("grid", 1024)
         self.max_memory = read("max_memory", 512.0, minimum=1e-3)
-        self.load_map = read("load_map", "")
-        self.save_map = read("save_map", "")
-        self._plugin = read.plugin
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
-        learns = spp > 0 and bool(scene.emitters()) and bool(scene.shapes())
-        if self.save_map and not self.load_map and not learns:
-            mi.Log(mi.LogLevel.Warn, f'Nothing is learned: "{self.save_map}" is not written.')
-        return learns
+        return spp > 0 and bool(scene.emitters()) and bool(scene.shapes())
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
-        """
-        Raises:
-            ValueError: The file ``save_map`` cannot be written.
-        """
-        if self.save_map:
-            try:
-                archives.check_target(Path(self.save_map), light_map_file.FORM)
-            except InputError as error:
-                raise ValueError(f'"{self._plugin}": "save_map": {error}') from None
-        scene = setting.scene
-        if not scene.emitters() or not scene.shapes():
-            return None
-        if setting.pilot_spp == 0 and not self.load_map:
+        if not self.can_learn(setting.scene, setting.pilot_spp):
             return None
         return LightMapLearner(
             self.target,
@@ -69,9 +47,6 @@ class LearnedLights(Technique):
             setting.pilot_samples,
             film_extent(setting.sensor.film())[0],
             setting.pixel_count * setting.spp,
-            Path(self.load_map) if self.load_map else None,
-            Path(self.save_map) if self.save_map else None,
-            self._plugin,
         )
 
     def parameters(self, *slots: Slots) -> dict[str, Any]:

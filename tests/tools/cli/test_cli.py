@@ -48,8 +48,8 @@ BAD_INPUT = [
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--integrator", ""], 'integrator "": expected'),
     (
         ["render", "{scene}", "-o", "{tmp}/a.exr", "--spp", "64", "--integrator",
-         "neepp:save_map={tmp}/none/map.npz"],
-        '"neepp": "save_map": {tmp}/none: no such folder',
+         "neepp:save_learned={tmp}/none/map.npz"],
+        '"neepp": "save_learned": {tmp}/none: no such folder',
     ),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "0"], "'--time': 0"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "1", "--spp", "1"], "combined"),

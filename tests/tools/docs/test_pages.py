@@ -38,7 +38,7 @@ VALUES = {
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
     "keep_learned": True,
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
-    "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",
+    "aovs": "d:depth", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "distance": "swarm",
     "light_numbers": "swarm", "scattering": "swarm",

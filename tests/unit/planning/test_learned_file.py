@@ -11,6 +11,8 @@ import pytest
 
 from mitsuba_ext.inputs.plugin_text import parse_plugin
 from mitsuba_ext.planning import kept_learning
+from mitsuba_ext.planning.learned_file import FORM, LearnedFile
+from mitsuba_ext.util import archives
 from tests.support.stage import film, sensor, stage
 from tests.support.statistical import load, one_thread, some
 
@@ -185,15 +187,52 @@ def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> Non
         _integrator("neepp", save_learned=str(target)).render(_small("rooms"), spp=16)
 
 
+def test_files_of_other_kinds_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    path, scene, where = tmp_path / "learned.npz", _small("open"), '"name": the parameter "key"'
+    file = LearnedFile(path, scene, "made by", where)
+    assert file.load() is None
+    arrays = {"counts": np.arange(4), "name": np.array("text")}
+    file.save({"one": arrays, "other": {"counts": np.arange(3)}})
+    stored, content = file.load().parts(), path.read_bytes()
+    assert {part: its.shape("counts") for part, its in stored.items()} == {
+        "one": (4,), "other": (3,)
+    }  # fmt: skip
+
+    def refusal() -> str:
+        with pytest.raises(ValueError) as caught:
+            file.load()
+        message = str(caught.value)
+        assert message.startswith(f'{where} names "{path}", which ') and "\n" not in message
+        return message
+
+    for form, words in {
+        FORM[:-1] + "0": "which is of another version: delete it",
+        "mitsuba_ext light-map 3": "which is a mitsuba_ext light-map 3: delete it",
+    }.items():
+        archives.write(path, form, arrays)
+        assert words in refusal()
+    archives.write(path, FORM, arrays)
+    assert 'without the array "scene"' in refusal()
+    for others in ({}, {"format": np.zeros(0)}, {"scene": np.array([{}], dtype=object)}):
+        np.savez(path, **{**arrays, **others})
+        assert "is damaged, or of another kind" in refusal()
+    image = b"\x76\x2f\x31\x01\x02\x00\x00\x00channels\x00"
+    for broken in (b"", b"PK nothing", image, content[:-500], content[:100], content[:-1]):
+        path.write_bytes(broken)
+        assert "damaged" in refusal()
+    path.unlink()
+    path.mkdir()
+    assert "of another kind" in refusal()
+
+
 def test_to_load_and_to_save_at_once_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match='leave "save_learned" out'):
         _integrator("neepp", save_learned=str(tmp_path / "a"), load_learned=str(tmp_path / "b"))
 
 
 @pytest.mark.parametrize(("plugin", "key", "suffix"), [
-    ("neepp", "save_learned", ".npz"), ("neepp", "save_map", ".npz"),
-    ("irradiance_cache", "cache_file", ".npz"), ("mlt", "chain_file", ".npz"),
-    ("bdpt", "technique_images", ".exr"),
+    ("neepp", "save_learned", ".npz"), ("irradiance_cache", "cache_file", ".npz"),
+    ("mlt", "chain_file", ".npz"), ("bdpt", "technique_images", ".exr"),
 ])  # fmt: skip
 def test_files_of_other_kinds_are_not_replaced(tmp_path: Path, plugin, key, suffix) -> None:
     """A scene names the file, and may be somebody else's."""

@@ -24,12 +24,21 @@ _REJECTED = "shadow rays that are rejected"
         ({"light_sampling": "uniform", "grid": 3}, "grid", _REJECTED),
         ({"light_sampling": "linear", "max_memory": 3.0}, "max_memory", _REJECTED),
         ({"light_sampling": "spatial", "pilot_spp": 3}, "pilot_spp", _REJECTED),
-        ({"light_sampling": "power", "save_map": "map.npz"}, "save_map", "visibility or contrib"),
     ],
 )
 def test_parameter_without_effect_is_refused(parameters, key, needs):
     with pytest.raises(RuntimeError, match=f'"neepp": the parameter "{key}" needs .*{needs}'):
         mi.load_dict({"type": "neepp", **parameters})
+
+
+@pytest.mark.parametrize(("key", "other"), [
+    ("save_map", "save_learned"), ("load_map", "load_learned"),
+])  # fmt: skip
+@pytest.mark.parametrize("plugin", ["neepp", "learned_lights"])
+def test_a_parameter_of_earlier_versions_says_what_replaces_it(plugin, key, other):
+    words = f'"{plugin}" has no parameter "{key}" any more: .*"{other}" instead$'
+    with pytest.raises(RuntimeError, match=words):
+        mi.load_dict({"type": plugin, key: "map.npz"})
 
 
 def test_only_parameters_with_an_effect_are_shown():

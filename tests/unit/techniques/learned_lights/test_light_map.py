@@ -273,10 +273,11 @@ def test_a_learned_map_serves_another_view_and_lowers_the_variance(tmp_path: Pat
     scene = _two_rooms()
     maps, files = [], [tmp_path / f"{run}.npz" for run in range(2)]
     for file in files:
-        learn = mi.load_dict({"type": "neepp", "max_depth": 2, "save_map": str(file)})
+        learn = mi.load_dict({"type": "neepp", "max_depth": 2, "save_learned": str(file)})
         mi.render(scene, integrator=learn, spp=64, seed=3)
         with np.load(file) as data:
-            maps.append([data[name] for name in ("tests", "successes", "squares")])
+            counters = ("tests", "successes", "squares")
+            maps.append([data[f"next_event/{name}"] for name in counters])
     for first, again in zip(*maps):
         # A ray in ten thousand may change its fate with the order in which floats are added
         assert (first == again).mean() > 0.999 and first.sum() == pytest.approx(again.sum(), 1e-3)
@@ -291,7 +292,7 @@ def test_a_learned_map_serves_another_view_and_lowers_the_variance(tmp_path: Pat
     use, path = (
         mi.load_dict({"max_depth": 2, **integrator})
         for integrator in (
-            {"type": "neepp", "load_map": str(files[0]), "pilot_spp": 0}, {"type": "path"}
+            {"type": "neepp", "load_learned": str(files[0]), "pilot_spp": 0}, {"type": "path"}
         )
     )
     images, reference = (

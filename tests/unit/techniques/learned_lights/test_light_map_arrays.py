@@ -1,8 +1,6 @@
-"""Files of light maps: they find their lights again, and damaged ones are refused."""
+"""Light maps as arrays: they find their lights again, and damaged ones are refused."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +9,8 @@ import pytest
 
 from mitsuba_ext.scene.fingerprint import digest, fingerprint
 from mitsuba_ext.scene.lights.division import emitter_shapes
-from mitsuba_ext.techniques.learned_lights import light_map_file
-from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
-from mitsuba_ext.techniques.learned_lights.light_map_file import FORM
-from mitsuba_ext.util import archives
+from mitsuba_ext.techniques.learned_lights.light_map_arrays import arrays_of, of_arrays
+from mitsuba_ext.util.stored_arrays import DamagedError, StoredArrays
 from tests.support.maps import floor, lamp, map_of
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -55,13 +51,12 @@ def _counts(scene: mi.Scene, light_map) -> dict[bytes, np.ndarray]:
     return {key: np.sort(np.concatenate(parts, axis=1)) for key, parts in counts.items()}
 
 
-def test_a_map_finds_its_lights_whatever_their_order(tmp_path: Path):
+def test_a_map_finds_its_lights_whatever_their_order():
     scene = _scene()
     other = _scene("other twin", "point", "sky", "long", "wide", "twin")
     saved = _numbered(scene)
     assert saved.cells.count > 100
-    light_map_file.save(tmp_path / "map.npz", scene, saved)
-    loaded = light_map_file.load(tmp_path / "map.npz", other, 0, MEMORY)
+    loaded = of_arrays(StoredArrays.of(arrays_of(scene, saved)), other, MEMORY)
     assert (loaded.tests != saved.tests).numpy().any(), "the order differs"
     expected, found = _counts(scene, saved), _counts(other, loaded)
     assert expected.keys() == found.keys() and len(found) == 5
@@ -72,7 +67,7 @@ def test_a_map_finds_its_lights_whatever_their_order(tmp_path: Path):
 
 
 def _damages(arrays: dict[str, np.ndarray]) -> dict[str, tuple[dict[str, np.ndarray], str]]:
-    """Damaged files by name: the arrays that differ, and what the error says."""
+    """Damages by name: the arrays that differ, and what the error says."""
     tests, p, bbox = arrays["tests"], arrays["p"], arrays["bbox"]
     nan = np.where(np.arange(p.shape[1]) == 3, np.nan, p).astype(np.float32)
     return {
@@ -100,64 +95,35 @@ def _damages(arrays: dict[str, np.ndarray]) -> dict[str, tuple[dict[str, np.ndar
         "text": ({"resolution": np.array("4")}, '"resolution" is of type'),
         "wide": ({"resolution": np.array(1000)}, 'more than the 64 of "max_memory"'),
         "other grid": ({"resolution": np.array(3)}, "has the shape"),
-        "other scene": ({"scene": np.array("x")}, "belongs to another scene"),
     }  # fmt: skip
 
 
-def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path):
+def test_damaged_arrays_are_refused_in_one_sentence():
     scene = floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1))
-    file = tmp_path / "map.npz"
-    light_map_file.save(file, scene, _numbered(scene))
-    content = file.read_bytes()
-    with np.load(file) as data:
-        arrays = {key: data[key] for key in data if key not in ("format", "digest")}
+    arrays = arrays_of(scene, _numbered(scene))
 
-    def refusal() -> str:
-        learner = LightMapLearner("contribution", 0, MEMORY, 1000, 64, load=file, plugin="name")
-        with pytest.raises(ValueError) as caught:
-            learner.start(scene, mi.Point3f(), mi.Normal3f())
+    def refusal(arrays: dict[str, np.ndarray]) -> str:
+        with pytest.raises(DamagedError) as caught:
+            of_arrays(StoredArrays.of(arrays), scene, MEMORY)
         message = str(caught.value)
-        assert message.startswith(f'"name": the parameter "load_map" names "{file}", which ')
-        assert "\n" not in message and ": " in message.split("which ")[1]
+        assert "\n" not in message and message.endswith(": learn it again")
         return message
 
     for name, (changes, expected) in _damages(arrays).items():
-        archives.write(file, FORM, {**arrays, **changes})
-        assert expected in refusal(), name
+        assert expected in refusal({**arrays, **changes}), name
     for key in arrays:
-        archives.write(file, FORM, {k: v for k, v in arrays.items() if k != key})
-        assert f'without the array "{key}"' in refusal()
-    archives.write(file, FORM[:-1] + "0", arrays)
-    assert "which is of another version" in refusal()
-    archives.write(file, "mitsuba_ext learned 3", arrays)
-    assert "which is a mitsuba_ext learned 3" in refusal()
-    for others in ({}, {"format": np.zeros(0)}, {"scene": np.array([{}], dtype=object)}):
-        np.savez(file, **{**arrays, **others})
-        assert "is damaged, or of another kind" in refusal()
-    image = b"\x76\x2f\x31\x01\x02\x00\x00\x00channels\x00"
-    contents = [b"", b"PK nothing", image, content[:-500], content[:100], content[:-1]]
-    # A byte that differs, here and there
-    for k in range(40, 400, 9):
-        contents.append(content[:k] + bytes([content[k] ^ 85]) + content[k + 1 :])
-    for broken in contents:
-        file.write_bytes(broken)
-        try:
-            light_map_file.load(file, scene, 0, MEMORY)
-        except ValueError as error:
-            assert "damaged" in str(error)
+        others = {name: array for name, array in arrays.items() if name != key}
+        assert f'without the array "{key}"' in refusal(others)
     # Other floats are none the worse
     doubles = {key: arrays[key].astype(float) for key in ("p", "n")}
-    archives.write(file, FORM, {**arrays, **doubles})
-    light_map_file.load(file, scene, 0, MEMORY)
-    np.save(tmp_path / "array.npy", arrays["tests"])
-    (tmp_path / "array.npy").rename(file)
-    assert "of another kind" in refusal()
-    file.unlink()
-    file.mkdir()
-    assert "of another kind" in refusal()
-    file.rmdir()
-    with pytest.raises(FileNotFoundError, match="which does not exist"):
-        light_map_file.load(file, scene, 0, MEMORY)
+    of_arrays(StoredArrays.of({**arrays, **doubles}), scene, MEMORY)
+
+
+def test_a_map_of_one_voxel_is_never_too_large():
+    """Learning makes it in any memory."""
+    scene = floor(a=lamp(0, 0, 1))
+    arrays = arrays_of(scene, map_of(scene, grid=1))
+    assert of_arrays(StoredArrays.of(arrays), scene, max_memory=1).rows.resolution == 1
 
 
 def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
@@ -168,9 +134,3 @@ def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
     assert base == of(a=lamp(0, 0, 1)) == of(a=lamp(0, 0, 1), s={"type": "perspective"})
     assert len({base, of(a=lamp(0, 0, 1.01)), of(a=lamp(0, 0, 1, radiance=1.1)),
                 of(a=lamp(0, 0, 1), b=lamp(0, 0, 2))}) == 4
-
-
-@pytest.mark.parametrize("key", ["load_map", "save_map"])
-def test_a_file_of_a_map_needs_learned_light_sampling(key: str):
-    with pytest.raises(RuntimeError, match=f'"{key}" needs lights that are chosen by'):
-        mi.load_dict({"type": "neepp", "light_sampling": "power", key: "map.npz"})

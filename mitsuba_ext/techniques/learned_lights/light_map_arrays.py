@@ -1,23 +1,17 @@
-"""Light maps in files: a map that was learned from one view of a scene serves other views."""
+"""Light maps as arrays, for files: a map serves other views of its scene, in other processes."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from ...scene.fingerprint import digest, fingerprint
+from ...scene.fingerprint import digest
 from ...scene.lights.division import emitter_shapes
 from ...scene.lights.light_cells import LightCells
 from ...scene.regions.surface_rows import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
-from ...util import archives
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .light_map import BYTES_PER_ENTRY, MOST_SQUARED, LightMap
-
-#: What these files hold, and the version of their format.
-FORM = "mitsuba_ext light-map 3"
 
 #: The finest grid of a map, a bound of the coordinates that keeps their differences finite, and the
 #: most vertices, of which a scout finds up to three for each of about 65,000 paths.
@@ -28,7 +22,6 @@ def arrays_of(scene: mi.Scene, light_map: LightMap) -> dict[str, np.ndarray]:
     """A map as arrays.
 
     Returns:
-        - scene: Fingerprint of the scene to which the map belongs.
         - bbox, resolution, p, n: Parameters of the rows; p and n of shape [3, vertices].
         - tests, successes, squares: The counters; shape [rows, cells]. The cells are in the order
           of their lights' digests: that of a scene's emitters differs from process to process.
@@ -39,7 +32,6 @@ def arrays_of(scene: mi.Scene, light_map: LightMap) -> dict[str, np.ndarray]:
         "tests": light_map.tests, "successes": light_map.successes, "squares": light_map.squares
     }
     return {
-        "scene": np.array(fingerprint(scene)),
         "bbox": np.array([rows.bbox.min, rows.bbox.max], dtype=np.float32),
         "resolution": np.array(rows.resolution),
         "p": rows.p.numpy(),
@@ -48,59 +40,16 @@ def arrays_of(scene: mi.Scene, light_map: LightMap) -> dict[str, np.ndarray]:
     }
 
 
-def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
-    """Writes a map."""
-    archives.write(path, FORM, arrays_of(scene, light_map))
-
-
 def of_arrays(arrays: StoredArrays, scene: mi.Scene, max_memory: int) -> LightMap:
-    """The map from the arrays of :func:`arrays_of`, for the same scene.
-
-    Raises:
-        ValueError: They are damaged, or too large: see :func:`load`.
-    """
-    return _restored(arrays, scene, 0, max_memory)
-
-
-def load(
-    path: Path, scene: mi.Scene, samples: int, max_memory: int, parameter: str = "load_map"
-) -> LightMap:
-    """Reads a map.
+    """The map from the arrays of :func:`arrays_of`, for the same scene. They are checked, because
+    later code computes addresses from them.
 
     Parameters:
-        path: The file.
-        scene: The scene of the map.
-        samples: Approximate number of samples that will be observed in addition.
-        max_memory: The most bytes that the map may take.
-        parameter: The parameter that named the file, for errors.
+        max_memory: The most bytes that a map of several voxels may take.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is no light map, damaged, too large, or the map of another scene.
+        DamagedError: They are no map, or too large.
     """
-    if not path.exists():
-        raise FileNotFoundError(
-            f'{parameter} names "{path}", which does not exist: give it a file that "save_map" '
-            f"wrote"
-        )
-    origin, remedy = f'{parameter} names "{path}", which', "delete it, and learn it again"
-    arrays = archives.read(path, FORM, origin, remedy)
-    if arrays.text("scene") != fingerprint(scene):
-        raise ValueError(
-            f"{origin} belongs to another scene, or this one has changed since: {remedy}"
-        )
-    try:
-        return _restored(arrays, scene, samples, max_memory)
-    except _TooLargeError as error:
-        raise ValueError(f"{origin} {error}") from None
-
-
-class _TooLargeError(ValueError):
-    pass
-
-
-def _restored(arrays: StoredArrays, scene: mi.Scene, samples: int, max_memory: int) -> LightMap:
-    """The map of checked arrays: later code computes addresses from them."""
     take = arrays.take
     resolution = int(arrays.number("resolution", "iu", 1, _MOST_VOXELS))
     bbox = take("bbox", "f", (2, 3), -_LARGEST, _LARGEST)
@@ -109,16 +58,13 @@ def _restored(arrays: StoredArrays, scene: mi.Scene, samples: int, max_memory: i
     n = take("n", "f", p.shape)
     is_inside = (bbox[0] <= p.T) & (p.T <= bbox[1])
     arrays.require(bool(is_inside.all(axis=1).any()), '"p" is outside of "bbox"')
-    if resolution**3 * BYTES_PER_VOXEL > max_memory:
-        raise _too_large(resolution**3 * BYTES_PER_VOXEL, max_memory)
+    _check_memory(arrays, resolution, 0, max_memory)
     bbox = mi.ScalarBoundingBox3f(*bbox.astype(np.float32))
     p, n = mi.Point3f(p.astype(np.float32)), mi.Normal3f(n.astype(np.float32))
     rows = SurfaceRows(bbox, resolution, p, n)
     cells = LightCells(scene, voxel_edges(bbox, resolution))
     shape = rows.count, cells.count
-    memory = rows.count * cells.count * BYTES_PER_ENTRY + resolution**3 * BYTES_PER_VOXEL
-    if memory > max_memory:
-        raise _too_large(memory, max_memory)
+    _check_memory(arrays, resolution, rows.count * cells.count, max_memory)
     counts = {
         name: take(name, "u", shape, 0, most, rows.count * cells.count)
         for name, most in (("tests", 0xFFFFFFFF), ("successes", 0xFFFFFFFF), ("squares", None))
@@ -130,17 +76,22 @@ def _restored(arrays: StoredArrays, scene: mi.Scene, samples: int, max_memory: i
     arrays.require(
         bool((counts["squares"] <= tests * MOST_SQUARED).all()), '"squares" are too large'
     )
-    light_map = LightMap(scene, rows, cells, samples)
+    light_map = LightMap(scene, rows, cells)
     place = np.argsort(_cell_order(scene, cells))
     kinds = {"tests": mi.UInt32, "successes": mi.UInt32, "squares": mi.UInt64}
     light_map.restore(*(from_numpy(kind, counts[k][:, place]) for k, kind in kinds.items()))
     return light_map
 
 
-def _too_large(memory: int, max_memory: int) -> _TooLargeError:
-    return _TooLargeError(
-        f"needs {memory / 2**20:.1f} MiB, more than the {max_memory / 2**20:g} of "
-        f'"max_memory": raise it, or learn a coarser map'
+def _check_memory(
+    arrays: StoredArrays, resolution: int, entries: int, max_memory: int
+) -> None:
+    memory = entries * BYTES_PER_ENTRY + resolution**3 * BYTES_PER_VOXEL
+    # As in learning, a single voxel may always be there
+    arrays.require(
+        resolution == 1 or memory <= max_memory,
+        f"its map needs {memory / 2**20:.1f} MiB, more than the {max_memory / 2**20:g} of "
+        f'"max_memory"',
     )
 
 
