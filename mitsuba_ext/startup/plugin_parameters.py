@@ -44,8 +44,8 @@ def unread(name: str, key: str, others: Sequence[str] = ()) -> str:
     ours = parameter_names(name)
     if ours and key in _REPLACED:
         return (
-            f'"{name}" has no parameter "{key}" any more: give its integrator the parameter '
-            f'"{_REPLACED[key]}" instead'
+            f'"{name}" has no parameter "{key}" any more: use the parameter "{_REPLACED[key]}" '
+            f"of the integrator"
         )
     if key in ours:
         return (
@@ -74,8 +74,8 @@ def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
     if key.startswith("_arg_"):
         raise ValueError(f'"{name}": {_nameless(value)}')
     message = unread(name, key)
-    is_misspelt = key in _REPLACED or "did you mean" in message
-    if hasattr(plugin, "technique") and not is_misspelt:
+    is_explained = key in _REPLACED or "did you mean" in message
+    if hasattr(plugin, "technique") and not is_explained:
         message += f"; it is for nesting in an integrator, with {_names(plugin)}"
     raise ValueError(message)
 

@@ -63,7 +63,7 @@ def read(path: Path, form: str, origin: str, remedy: str) -> StoredArrays:
     Args:
         path: The file, which exists.
         form: As for :func:`write`.
-        origin: The beginning of error messages, such as ``"load_map" names "x.npz", which``.
+        origin: The beginning of error messages, such as ``"load_learned" names "x.npz", which``.
         remedy: The end of error messages, which says what the user can do.
 
     Raises:

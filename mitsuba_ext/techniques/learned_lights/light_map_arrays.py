@@ -87,7 +87,7 @@ def _check_memory(
     arrays: StoredArrays, resolution: int, entries: int, max_memory: int
 ) -> None:
     memory = entries * BYTES_PER_ENTRY + resolution**3 * BYTES_PER_VOXEL
-    # As in learning, a single voxel may always be there
+    # Learning makes a map of one voxel in any memory
     arrays.require(
         resolution == 1 or memory <= max_memory,
         f"its map needs {memory / 2**20:.1f} MiB, more than the {max_memory / 2**20:g} of "

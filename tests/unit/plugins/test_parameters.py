@@ -36,7 +36,7 @@ def test_parameter_without_effect_is_refused(parameters, key, needs):
 ])  # fmt: skip
 @pytest.mark.parametrize("plugin", ["neepp", "learned_lights"])
 def test_a_parameter_of_earlier_versions_says_what_replaces_it(plugin, key, other):
-    words = f'"{plugin}" has no parameter "{key}" any more: .*"{other}" instead$'
+    words = f'"{plugin}" has no parameter "{key}" any more: .*"{other}" of the integrator$'
     with pytest.raises(RuntimeError, match=words):
         mi.load_dict({"type": plugin, key: "map.npz"})
 
