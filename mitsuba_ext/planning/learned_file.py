@@ -34,8 +34,9 @@ class LearnedFile:
     Attributes:
         path: The file, which need not exist.
         scene: The scene for which it is valid.
-        made_by: The parameters, and whatever else it depends on.
-        where: What error messages begin with: the plugin, and the parameter that names the file.
+        made_by: The parameters on which its contents depend, as text. The text of another render
+            must be the same.
+        where: The beginning of error messages: the plugin, and its parameter that names the file.
     """
 
     path: Path
@@ -53,7 +54,7 @@ class LearnedFile:
             OSError: It cannot be written.
         """
         arrays = {
-            f"{part}/{name}": array for part, its in parts.items() for name, array in its.items()
+            f"{part}/{name}": array for part, x in parts.items() for name, array in x.items()
         }
         header = {"scene": np.array(fingerprint(self.scene)), "made_by": np.array(self.made_by)}
         archives.write(self.path, FORM, {**header, **arrays})

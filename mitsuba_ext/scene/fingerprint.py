@@ -31,7 +31,7 @@ def digest(scene_object: mi.Object) -> bytes:
 
 
 def sensor_digest(sensor: mi.Sensor) -> str:
-    """A hash of a sensor's class, its motion, and the parameters that it exposes by name."""
+    """A hash of a sensor's class, its motion, and its named parameters."""
     values = mi.traverse(sensor)
     motion = getattr(sensor, "motion", "")
     text = "".join(f"{key}={values[key]}" for key in sorted(values.keys()))

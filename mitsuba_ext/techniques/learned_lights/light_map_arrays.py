@@ -24,7 +24,8 @@ def arrays_of(scene: mi.Scene, light_map: LightMap) -> dict[str, np.ndarray]:
     Returns:
         - bbox, resolution, p, n: Parameters of the rows; p and n of shape [3, vertices].
         - tests, successes, squares: The counters; shape [rows, cells]. The cells are in the order
-          of their lights' digests: that of a scene's emitters differs from process to process.
+          of their lights' digests, because the order of a scene's emitters differs from process to
+          process.
     """
     rows, cells = light_map.rows, light_map.cells
     order = _cell_order(scene, cells)
