@@ -99,7 +99,7 @@ class Connector:
     def unoccluded(
         self,
         state: Any,
-        survival_sample: mi.Float | tuple[()],
+        survival_sample: mi.Float | None,
         vertex: Vertex,
         β: mi.Spectrum,
         connection: Connection,
@@ -107,7 +107,7 @@ class Connector:
         pdf: mi.Float,
         count: mi.Float | float,
         active: mi.Bool,
-        inside: Any = (),
+        inside: Any = None,
         sampler: mi.Sampler | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool, mi.Bool, mi.Bool, Any]:
         """The light that a connection adds to a path.
@@ -154,9 +154,9 @@ class Connector:
         )
         return value, considered, tested, visible, state
 
-    def survival_sample(self, sampler: mi.Sampler) -> mi.Float | tuple[()]:
-        """The number that decides whether a connection is tested; ``()`` if all are."""
-        return () if isinstance(self._shadow_test, AlwaysTest) else sampler.next_1d()
+    def survival_sample(self, sampler: mi.Sampler) -> mi.Float | None:
+        """The number that decides whether a connection is tested; ``None`` if all are."""
+        return None if isinstance(self._shadow_test, AlwaysTest) else sampler.next_1d()
 
     def _roulette(self, state, connection, survival_sample, si, active):
         """Lets the shadow test's decision drop connections; the survivors weigh 1/p. Returns the
@@ -231,7 +231,7 @@ class Connector:
         # Where there is no connection, nothing is added
         share = vertex.path.β / dr.maximum(count, 1)
         # Without media, the loop draws no numbers
-        drawn = sampler if self._media.exist else ()
+        drawn = sampler if self._media.exist else None
         while active:
             numbers, weight = self._connections.numbers(
                 chosen, index, dimension, active
@@ -250,9 +250,9 @@ class Connector:
         return total, connection_count, shadow_count, shadow_state
 
 
-def _turned(sample: mi.Float | tuple[()], index: mi.UInt32) -> mi.Float | tuple[()]:
+def _turned(sample: mi.Float | None, index: mi.UInt32) -> mi.Float | None:
     """The number of connection ``index``: uniform if ``sample`` is, evenly spread over indices."""
-    if isinstance(sample, tuple):
-        return sample
+    if sample is None:
+        return None
     turned = dr.fma(mi.Float(index), _GOLDEN, sample)
     return turned - dr.floor(turned)

@@ -28,7 +28,7 @@ class Distances:
 
     def begin(self, rays: CameraRays) -> Any:
         """The state before the first flight: has the number of the ray been used?"""
-        return () if rays.distance is None else mi.Bool(False)
+        return None if rays.distance is None else mi.Bool(False)
 
     def draw(
         self, state: Any, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool

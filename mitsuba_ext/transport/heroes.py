@@ -62,8 +62,8 @@ def warn_of_sampler(scene: mi.Scene, sampler: mi.Sampler) -> None:
 class Heroes:
     """Lets dispersive BSDFs refract only the hero. Adds no code where nothing disperses.
 
-    Its state says whether only the hero is left of a path: a mask, or ``()`` where nothing
-    disperses.
+    Its state says whether only the hero is left of a path: a mask, or ``None`` where
+    nothing disperses.
 
     Parameters:
         scene: The scene.
@@ -83,9 +83,9 @@ class Heroes:
             ctx.type_mask |= DISPERSES
         return ctx
 
-    def begin(self) -> Any:
+    def begin(self) -> mi.Bool | None:
         """The state before the first bounce."""
-        return mi.Bool(False) if self._is_needed else ()
+        return mi.Bool(False) if self._is_needed else None
 
     def connect(
         self,

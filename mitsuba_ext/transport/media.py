@@ -69,7 +69,7 @@ class NoMedia:
 
     def begin(self, sampler, rays: CameraRays) -> Any:
         """The state of camera rays."""
-        return ()
+        return None
 
     def launch(self, inside, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
         """``ray``, shortened to the distance at which a homogeneous medium scatters, and the state.

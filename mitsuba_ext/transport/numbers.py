@@ -89,10 +89,10 @@ def copied(numbers: Numbers) -> Numbers:
 
 
 def reached(numbers: Numbers) -> Any:
-    """The position that ``numbers`` have reached, for a frozen function to return; ``()`` for a
+    """The position that ``numbers`` have reached, for a frozen function to return; ``None`` for a
     sampler, which keeps its own."""
     if isinstance(numbers, mi.Sampler):
-        return ()
+        return None
     if isinstance(numbers, BothEnds):
         return reached(numbers.camera), reached(numbers.light)
     return _arrays(numbers)

@@ -4,7 +4,7 @@ at infinity.
 
 Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
 therefore a *state* that its methods take and return; its attributes are read-only during the walk.
-``()`` is the state of a decision that remembers nothing.
+``None`` is the state of a decision that remembers nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class DirectionSamples:
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         """The state before the first bounce of paths that begin in ``pixel`` of the film."""
-        return ()
+        return None
 
     def draw(
         self, state: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
@@ -45,7 +45,7 @@ class Scattering:
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         """The state before the first bounce."""
-        return ()
+        return None
 
     def sample(
         self,
@@ -105,13 +105,13 @@ class EmitterSampling:
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None = None) -> Any:
         """The state before the first bounce of paths that begin in ``pixel`` of the film."""
-        return ()
+        return None
 
     def visit(
         self, state: Any, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> Any:
         """The place of the vertex ``si``: what :meth:`sample` and :meth:`remember` need there."""
-        return ()
+        return None
 
     def sample(
         self,
@@ -217,7 +217,7 @@ class Weights:
 
     def begin(self, ray: mi.Ray3f) -> Any:
         """The sums before the first vertex."""
-        return ()
+        return None
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
         """The sums at the vertex ``si``; ``path`` holds those of :meth:`leave` at the last one."""
@@ -361,7 +361,7 @@ class ShadowTest:
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         """The state before the first bounce."""
-        return ()
+        return None
 
     def probability(
         self,
@@ -393,7 +393,7 @@ class Roulette:
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         """The state before the first bounce."""
-        return ()
+        return None
 
     def survival(
         self, state: Any, vertex: Vertex, path: PathState, active: mi.Bool

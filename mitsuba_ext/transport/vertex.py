@@ -36,9 +36,9 @@ class PathState:
             is left. Russian roulette divides it out.
         depth: Number of vertices before this one, without the sensor's.
         arrival: How the path came to the vertex.
-        hero_is_alone: Is only the first of the four wavelengths left? ``()`` where nothing in the
-            scene disperses light.
-        sums: What MIS weights need about other techniques that can sample this path; ``()`` where
+        hero_is_alone: Whether only the first of the four wavelengths is left; ``None`` where
+            nothing in the scene disperses light.
+        sums: What MIS weights need about other techniques that can sample this path; ``None`` where
             the densities at the last vertex suffice.
     """
 
@@ -47,8 +47,8 @@ class PathState:
     sampling_weight: mi.Float
     depth: mi.UInt32
     arrival: Arrival
-    hero_is_alone: Any
-    sums: Any = ()
+    hero_is_alone: mi.Bool | None
+    sums: Any = None
 
 
 @dataclass

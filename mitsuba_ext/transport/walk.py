@@ -282,4 +282,4 @@ class Walk:
             return connector.one(place, sampler, vertex, active)
         if not is_made:
             sampler.next_2d()  # the numbers that follow are those of `path`
-        return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), ())
+        return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), None)

@@ -186,6 +186,7 @@ def weights_of_techniques(
         left = sums.leave(
             by_light[-1], cosine, pdf,
             reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta, a is vertices[0],
+            by_light=True,
         )  # fmt: skip
         by_light.append(
             sums.arrive(
@@ -196,7 +197,7 @@ def weights_of_techniques(
     # ----- Subpaths from the camera -----
     path = PathState(
         mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0),
-        Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), (),
+        Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), None,
         weights.begin(paths.camera_ray),
     )  # fmt: skip
     by_camera: list[Vertex] = []
@@ -216,7 +217,7 @@ def weights_of_techniques(
         state = next_event.remember(place, scene, si.to_world(bs.wo), mi.Float(0), active)
         path = PathState(
             mi.Spectrum(1), mi.Float(1), mi.Float(1), path.depth + 1,
-            Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), (), weights.leave(vertex, bs),
+            Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), None, weights.leave(vertex, bs),
         )  # fmt: skip
 
     # ----- s = 0, 1 -----
@@ -291,9 +292,8 @@ def weights_of_techniques(
         seen = weight(sums.others(density, by_light[-1], reverse) / sums.image_count)
         found.append(dr.select(last.is_delta, 0, seen))
         ends = density, by_light[-1], reverse, len(vertices) == 1
-        ratios.append(
-            [*(sums.by_camera(*ends) / LIGHT_PATHS), *(sums.by_kind(*ends) / sums.image_count)]
-        )
+        kinds = sums.by_kind(*ends, by_light=True) / sums.image_count
+        ratios.append([*(sums.by_camera(*ends) / LIGHT_PATHS), *kinds])
     # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
     can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
     found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]

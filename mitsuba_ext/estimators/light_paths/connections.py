@@ -76,8 +76,8 @@ def joining_rivals(
     to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
     ends = to_other, other.sums, other.reverse_pdf, is_first[1]
-    kinds = sums.by_kind(*ends)
-    kinds += sums.by_kind(to_one, one.sums, one.reverse_pdf, is_first[0])
+    kinds = sums.by_kind(*ends, by_light=True)
+    kinds += sums.by_kind(to_one, one.sums, one.reverse_pdf, is_first[0], by_light=False)
     kinds /= sums.count * sums.ratio(expected)
     return Rivals(sums.by_camera(*ends) * factor, kinds)
 
@@ -183,7 +183,7 @@ class LightSubpaths(Subpaths):
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._techniques is not None:
-            rivals = ()
+            rivals = None
             if self._sums.splits:
                 rivals = joining_rivals(
                     self._sums, near_end, far_end, squared_distance,

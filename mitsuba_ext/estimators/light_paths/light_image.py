@@ -121,7 +121,7 @@ class LightImage:
         )
         importance = connection.importance * lens_weight
         value *= vertex.β * (importance * self._share)
-        mis, rivals = mi.Float(1), ()
+        mis, rivals = mi.Float(1), None
         if self._sums is not None:
             active &= self._sums.is_open(si, to_camera)
             # The density per area with which a camera ray finds the vertex, divided by the density
@@ -131,7 +131,7 @@ class LightImage:
             mis = weight(others / self._sums.image_count)
             if self._sums.splits:
                 ends = found, vertex.sums, reverse_pdf, vertex.depth == 1
-                kinds = self._sums.by_kind(*ends) / self._sums.image_count
+                kinds = self._sums.by_kind(*ends, by_light=True) / self._sums.image_count
                 rivals = Rivals(self._sums.by_camera(*ends), kinds)
             value *= mis
         # A connection that cannot contribute needs no shadow ray

@@ -77,17 +77,21 @@ class VertexStore:
         β: mi.Spectrum,
         sums: Sums,
         depth: mi.UInt32,
-        hero_is_alone: Any,
+        hero_is_alone: mi.Bool | None,
         active: mi.Bool,
     ) -> None:
         """Writes a vertex."""
         mark = mi.UInt32(depth)
-        if not isinstance(hero_is_alone, tuple):
+        if hero_is_alone is not None:
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
         if self.layout.has_region:
             mark |= sums.region << _DEPTH_BITS
-        words = [*β, *[sums.last, sums.dVC, *sums.by_camera][: self.layout.sums]]
-        words += [*([sums.by_kind.x] if self.layout.sums > 4 else []), as_float(mark)]
+        words = [*β]
+        if self.layout.sums > 0:
+            words += [sums.last, sums.dVC]
+        if self.layout.sums > 2:
+            words += [*sums.by_camera, sums.by_kind.x]
+        words.append(as_float(mark))
         words += to_words(si, self.layout.is_whole)
         words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), slot, active)
@@ -108,7 +112,8 @@ class LightVertex:
         β: Radiance · throughput / density of the path up to the vertex.
         sums: Partial sums of the MIS weights (0 if none are stored).
         depth: Segments between the light and the vertex; at least 1.
-        hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
+        hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
+            light.
         lane: The number of the light path.
     """
 
@@ -116,7 +121,7 @@ class LightVertex:
     β: mi.Spectrum
     sums: Sums
     depth: mi.UInt32
-    hero_is_alone: Any
+    hero_is_alone: mi.Bool | None
     lane: mi.UInt32
 
 
@@ -188,7 +193,7 @@ class LightVertices:
         si.time = self._of_lane(self._time, lane, active)
         if mi.is_spectral:
             si.wavelengths = self._of_lane(self._wavelengths, lane, active)
-        hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else ()
+        hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else None
         β = mi.Spectrum(*(w[i] for i in range(n)))
         return LightVertex(si, β, sums, depth, hero_is_alone, lane)
 

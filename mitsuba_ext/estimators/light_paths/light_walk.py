@@ -46,9 +46,10 @@ class LightPaths:
         sums: Partial sums of the MIS weights: at the first vertex, those of the vertex; later,
             those of the direction that led to it (:meth:`PartialSums.leave`).
         depth: Segments between the light and the vertex.
-        hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
+        hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
+            light.
         scatter_count: Rays traced in directions that were sampled from a BSDF.
-        inside: The state between two vertices (``transport/media.py``); ``()`` without media.
+        inside: The state between two vertices (``transport/media.py``); ``None`` without media.
         active: Paths that have not ended.
     """
 
@@ -59,7 +60,7 @@ class LightPaths:
     sampling_weight: mi.Float
     sums: Sums
     depth: mi.UInt32
-    hero_is_alone: Any
+    hero_is_alone: mi.Bool | None
     scatter_count: mi.UInt32
     inside: Any
     active: mi.Bool
@@ -150,7 +151,7 @@ class LightWalk:
                 dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
                 Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
             )  # fmt: skip
-            if not isinstance(paths.hero_is_alone, tuple):
+            if paths.hero_is_alone is not None:
                 paths.hero_is_alone = dr.zeros(mi.Bool, width)
             return paths, reached(numbers)
 
@@ -175,7 +176,7 @@ class LightWalk:
         # In the same kernel: evaluating the sampler's state later would trace the walk again
         schedule_state(numbers)
         dr.eval(paths, store.words, store.is_taken)
-        disperses = not isinstance(paths.hero_is_alone, tuple)
+        disperses = paths.hero_is_alone is not None
         return LightVertices(store, time, wavelengths, disperses), paths
 
     def run(
@@ -297,7 +298,7 @@ class LightWalk:
         """An emitted ray, up to where it scatters in a medium at most, and the state there."""
         media = self._media(scene)
         if not media.exist:
-            return emitted.ray, ()
+            return emitted.ray, None
         medium = medium_at_start(self.query, scene, emitted, self.outside, active)
         rays = CameraRays(emitted.ray, medium=medium)
         inside = media.begin(numbers, rays)
@@ -328,7 +329,7 @@ class LightWalk:
             later.by_camera,
             later.region,
             later.count,
-            ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else (),
+            ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else None,
             later.by_kind,
         )
 
@@ -350,7 +351,7 @@ class LightWalk:
             passes = is_delta | ~self._stores(bsdf)
             cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
             sums = self.sums.leave(
-                sums, cosine, bs.pdf, reverse_pdf, passes, paths.depth == 1
+                sums, cosine, bs.pdf, reverse_pdf, passes, paths.depth == 1, by_light=True
             )
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
 
@@ -364,4 +365,4 @@ class LightWalk:
         the flux that light paths carry."""
         arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(False))
         path = PathState(β, mi.Float(1), sampling_weight, depth, arrival, hero_is_alone)
-        return self.roulette.survival((), Vertex(si, bsdf, path), path, active)[0]
+        return self.roulette.survival(None, Vertex(si, bsdf, path), path, active)[0]

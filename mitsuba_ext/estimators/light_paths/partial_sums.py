@@ -9,7 +9,7 @@ MIS heuristic.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -31,30 +31,31 @@ class Sums:
             connects the last two vertices. At the first vertex, instead, times the ratio of the
             densities with which next event estimation and emission sample the point on the light.
         dVC: The sum over the techniques that connect earlier vertices of the subpath.
-        by_camera: Only for light paths, from the second vertex on, and if :class:`PartialSums`
-            computes it: the two terms of dVC in which a camera path finds the whole path (s = 0 and
-            1), not raised to the exponent.
-        by_kind: Only if :class:`PartialSums` computes it: the parts of dVC of connections (s, t ≥
-            2), and of the light image (t = 1; only for camera paths).
-        region, count: Only if the light path vertices for connections are chosen by regions
-            (otherwise ``()``): the region of the last vertex; and the factor of ``dVCM`` where the
-            technique that connects the last two vertices is such a connection.
-        is_caustic: Only for light paths: was the direction that led to the last vertex sampled
-            from a delta lobe?
+        by_camera: The two terms of dVC in which a camera path finds the whole path (s = 0 and 1),
+            not raised to the exponent, from the second vertex on. ``None`` for camera paths, and if
+            :class:`PartialSums` does not compute it.
+        region: The region of the last vertex; ``None`` if the light path vertices for connections
+            are not chosen by regions.
+        count: Likewise, the factor of ``dVCM`` where the technique that connects the last two
+            vertices is such a connection.
+        is_caustic: Whether the direction that led to the last vertex was sampled from a delta lobe;
+            ``None`` for camera paths, and if vertices are not merged.
+        by_kind: The parts of dVC of connections (s, t ≥ 2), and of the light image (t = 1; only for
+            camera paths); ``None`` if :class:`PartialSums` does not compute it.
     """
 
     dVCM: mi.Float
     dVC: mi.Float
-    by_camera: mi.Vector2f | tuple[()] = ()
-    region: Any = ()
-    count: Any = ()
-    is_caustic: Any = ()
-    by_kind: mi.Vector2f | tuple[()] = ()
+    by_camera: mi.Vector2f | None = None
+    region: mi.UInt32 | None = None
+    count: mi.Float | None = None
+    is_caustic: mi.Bool | None = None
+    by_kind: mi.Vector2f | None = None
 
     @property
     def last(self) -> mi.Float:
         """``dVCM``, times ``count`` if vertices are chosen by regions."""
-        return self.dVCM if isinstance(self.count, tuple) else self.dVCM * self.count
+        return self.dVCM if self.count is None else self.dVCM * self.count
 
 
 @dataclass
@@ -183,7 +184,7 @@ class PartialSums:
         others = sums.last + self.ratio(reverse_pdf) * sums.dVC
         if self.merging is not None and self.merges_all:
             others += self.merging
-        elif self.merging is not None and not isinstance(sums.is_caustic, tuple):
+        elif self.merging is not None and sums.is_caustic is not None:
             others += dr.select(sums.is_caustic, self.merging, 0)
         return self.ratio(density) * others
 
@@ -214,8 +215,8 @@ class PartialSums:
         """Those of merging. The parameters are those of :meth:`merging_weight`; ``is_first`` tells
         whether the light path's, and the camera path's vertex is its first one."""
         inverse, one = dr.rcp(self.merging), mi.Float(1)
-        kinds = self.by_kind(one, light, pdf, is_first[0])
-        kinds += self.by_kind(one, camera, reverse_pdf, is_first[1])
+        kinds = self.by_kind(one, light, pdf, is_first[0], by_light=True)
+        kinds += self.by_kind(one, camera, reverse_pdf, is_first[1], by_light=False)
         return Rivals(
             self.by_camera(self.root(inverse), light, pdf, is_first[0]), kinds * inverse
         )
@@ -283,7 +284,7 @@ class PartialSums:
             by_light: Is it a light path?
         """
         inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
-        region, count = (), ()
+        region, count = None, None
         if self.selection is not None:
             region = self.selection.region(from_both_ends(si), si.is_valid())
             ends = (region, sums.region) if by_light else (sums.region, region)
@@ -293,10 +294,10 @@ class PartialSums:
         return Sums(
             sums.dVCM * self.ratio(squared_distance * inverse),
             sums.dVC * self.ratio(inverse),
-            () if isinstance(sums.by_camera, tuple) else sums.by_camera * inverse,
+            None if sums.by_camera is None else sums.by_camera * inverse,
             region,
             count,
-            by_kind=sums.by_kind * self.ratio(inverse) if self.splits else (),
+            by_kind=sums.by_kind * self.ratio(inverse) if self.splits else None,
         )
 
     def leave(
@@ -307,6 +308,7 @@ class PartialSums:
         reverse_pdf: mi.Float,
         is_delta: mi.Bool,
         is_first: mi.Bool | bool,
+        by_light: bool,
     ) -> Sums:
         """The sums behind a vertex, after a direction was sampled there.
 
@@ -317,6 +319,7 @@ class PartialSums:
                 vertex, per solid angle.
             is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.
             is_first: Is this the first vertex of the subpath?
+            by_light: Is it a light path?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
         smooth = self.others(leaves, sums, reverse_pdf)
@@ -328,45 +331,51 @@ class PartialSums:
             self._leave_by_camera(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
             sums.region,
             sums.count,
-            by_kind=self._leave_by_kind(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
+            by_kind=self._leave_by_kind(
+                sums, cosine, leaves, reverse_pdf, is_delta, is_first, by_light
+            ),
         )
 
     def by_kind(
-        self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
-    ) -> mi.Vector2f | tuple[()]:
-        """The parts of :meth:`others` (whose parameters these are) of connections and of the light
-        image. ``()`` if ``splits`` is not set."""
+        self,
+        density: mi.Float,
+        sums: Sums,
+        reverse_pdf: mi.Float,
+        is_first: mi.Bool | bool,
+        by_light: bool,
+    ) -> mi.Vector2f | None:
+        """The parts of :meth:`others` of connections and of the light image. The parameters are
+        those of :meth:`others` and of :meth:`arrive`. ``None`` if ``splits`` is not set."""
         if not self.splits:
-            return ()
+            return None
         # What connects to the first vertex: the sensor for a camera path, a light for a light path
-        is_camera = isinstance(sums.by_camera, tuple)
-        last = dr.select(is_first, mi.Vector2f(0, 1 if is_camera else 0), mi.Vector2f(1, 0))
+        last = dr.select(is_first, mi.Vector2f(0, 0 if by_light else 1), mi.Vector2f(1, 0))
         return self.ratio(density) * (
             last * sums.last + self.ratio(reverse_pdf) * sums.by_kind
         )
 
-    def _leave_by_kind(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
-        smooth = self.by_kind(leaves, sums, reverse_pdf, is_first)
-        if isinstance(smooth, tuple):
-            return ()
+    def _leave_by_kind(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first, by_light):
+        smooth = self.by_kind(leaves, sums, reverse_pdf, is_first, by_light)
+        if smooth is None:
+            return None
         return dr.select(is_delta, sums.by_kind * self.ratio(cosine), smooth)
 
     def by_camera(
         self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
-    ) -> mi.Vector2f | tuple[()]:
+    ) -> mi.Vector2f | None:
         """The densities with which a camera path alone finds the whole path (s = 0 and 1), each
         divided by that of connecting to the last vertex of the light path. The parameters are those
-        of :meth:`others`; the ratios are not raised to the exponent. ``()`` if ``splits`` is not
+        of :meth:`others`; the ratios are not raised to the exponent. ``None`` if ``splits`` is not
         set."""
-        if isinstance(sums.by_camera, tuple):
-            return ()
+        if sums.by_camera is None:
+            return None
         first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))
         return density * dr.select(is_first, first, reverse_pdf * sums.by_camera)
 
     def _leave_by_camera(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
         smooth = self.by_camera(leaves, sums, reverse_pdf, is_first)
-        if isinstance(smooth, tuple):
-            return ()
+        if smooth is None:
+            return None
         hit = mi.Vector2f(self.root(sums.dVC), 0)
         return dr.select(
             is_delta, dr.select(is_first, hit, sums.by_camera) * cosine, smooth

@@ -108,7 +108,9 @@ class BidirectionalWeights(Weights):
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
         if self._observer is not None:
             self._observer.weighed(
-                self.sums.by_kind(emitted * inverse, sums, reverse, vertex.depth == 0)
+                self.sums.by_kind(
+                    emitted * inverse, sums, reverse, vertex.depth == 0, by_light=False
+                )
             )
         return weight(others)
 
@@ -120,7 +122,7 @@ class BidirectionalWeights(Weights):
         cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
         cosine = dr.select(self.sums.is_open(si, bs.wo), cosine, 0)
         sums = self.sums.leave(
-            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
+            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0, by_light=False
         )
         if self.sums.merging is not None:
             ref = vertex.path.arrival.ref

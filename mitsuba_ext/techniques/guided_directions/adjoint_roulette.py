@@ -77,6 +77,6 @@ class AdjointRoulette(Roulette):
         p = dr.select(radiance < 0, 1, p)
         if vertex.medium is not None:
             # No mean is known in media, and paths scatter there often
-            by_throughput, _ = super().survival((), vertex, path, active)
+            by_throughput, _ = super().survival(None, vertex, path, active)
             p = dr.select(vertex.medium.scatters, by_throughput, p)
         return dr.select(path.depth >= _DEEP, dr.minimum(p, _DEEP_PROBABILITY), p), state

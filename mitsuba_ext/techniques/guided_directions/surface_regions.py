@@ -54,11 +54,11 @@ class SurfaceRegions:
 
     # ---- During the walk ----
 
-    def begin(self, pixel: mi.UInt32 | None) -> tuple:
+    def begin(self, pixel: mi.UInt32 | None) -> None:
         """There is no state."""
-        return ()
+        return None
 
-    def tree(self, state: tuple, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+    def tree(self, state: None, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The tree of the smallest region that contains a vertex."""
         return self.label(si, None, active)
 

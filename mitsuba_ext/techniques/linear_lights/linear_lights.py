@@ -107,11 +107,11 @@ class LinearChoice(EmitterSampling):
         self._uniform = from_numpy(mi.Float, positive / len(candidates))
 
     def begin(self, sampler, ray, pixel=None) -> Any:
-        return Estimates(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else ()
+        return Estimates(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else None
 
     def visit(self, state, scene, si, active):
         if self.count == 1:
-            return ()
+            return None
         normal = dr.mulsign(si.sh_frame.n, si.wi.z)
         bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
         known = active & (bsdf < len(self._opaque))
@@ -121,7 +121,7 @@ class LinearChoice(EmitterSampling):
 
     def sample(self, place, scene, numbers, si, active):
         if self.count == 1:
-            return *self.cells.sample(mi.UInt32(0), si, numbers.point, active), ()
+            return *self.cells.sample(mi.UInt32(0), si, numbers.point, active), None
         made_from, sums = place
         index, probability = self._choose(
             si.p, made_from.normal, made_from.is_opaque, made_from.total, sums, numbers.choice,
@@ -129,10 +129,10 @@ class LinearChoice(EmitterSampling):
         )  # fmt: skip
         ds, weight = self.cells.sample(index, si, numbers.point, active)
         ds.pdf *= probability
-        return ds, dr.select(probability > 0, weight / probability, 0), ()
+        return ds, dr.select(probability > 0, weight / probability, 0), None
 
     def remember(self, place, scene, d, pdf, active):
-        return place[0] if self.count > 1 else ()
+        return place[0] if self.count > 1 else None
 
     def density(self, state, scene, ref, si, ds, active):
         # Whole emitters: the number of a cell is the number of its emitter

@@ -79,7 +79,7 @@ class MappedLobes(DirectionSamples):
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         self.records = BounceRecords(dr.width(ray), BOUNCES) if self.is_recorded else None
         if pixel is None or (self.maps is None and self.records is None):
-            return ()
+            return None
         is_uniform = mi.Bool(self.maps is None)
         if self.maps is not None:
             is_uniform = sampler.next_1d() < _UNIFORM_SHARE
@@ -89,7 +89,7 @@ class MappedLobes(DirectionSamples):
 
     def draw(self, state, sampler, vertex, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-        if isinstance(state, tuple) and not state:
+        if state is None:
             return sample_1, sample_2, 1.0, state
         tile, reflections, was_front, is_uniform, product = state
         incident = vertex.si.to_world(vertex.si.wi)

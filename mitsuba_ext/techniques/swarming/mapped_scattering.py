@@ -49,10 +49,10 @@ class MappedScattering(Scattering):
             self.cell = dr.zeros(mi.UInt32, lanes)
             self.density, self.inverse = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes)
             dr.eval(self.lane, self.cell, self.density, self.inverse)
-        return mi.Bool(True) if self.maps is not None or self.is_recorded else ()
+        return mi.Bool(True) if self.maps is not None or self.is_recorded else None
 
     def sample(self, state, ctx, vertex, wo, sample_1, sample_2):
-        if isinstance(state, tuple):
+        if state is None:
             return super().sample(state, ctx, vertex, wo, sample_1, sample_2)
         is_first = state & is_smooth(vertex)
         if self.maps is None:
@@ -94,7 +94,7 @@ class MappedScattering(Scattering):
 
     def eval_pdf(self, state, ctx, vertex, wo, active):
         value, pdf = super().eval_pdf(state, ctx, vertex, wo, active)
-        if isinstance(state, tuple) or self.maps is None:
+        if state is None or self.maps is None:
             return value, pdf
         is_first = state & is_smooth(vertex) & active
         return value, self._with_map(self._table(vertex), vertex, wo, pdf, is_first)

@@ -134,7 +134,7 @@ class TwoStage(EmitterSampling):
         ds = self._texels.directions.sample(si, d)
         ds.uv, ds.pdf = uv, dr.select(active, density * probability, 0)
         value = self._texels.radiance(si, ds, active)
-        choice = ()
+        choice = None
         if self._counts is not None:
             where = point
             if not self._in_primary_space:

@@ -35,7 +35,7 @@ class WeightedConnections(ConnectionCount):
     def begin(self, sampler, choice_dimension):
         number = self._sets.choose(sampler.next_1d())
         shift = sampler.next_2d()
-        return number, shift, sampler.next_2d() if choice_dimension > 0 else ()
+        return number, shift, sampler.next_2d() if choice_dimension > 0 else None
 
     def numbers(self, chosen, index, choice_dimension, active):
         number, shift, choice_shift = chosen

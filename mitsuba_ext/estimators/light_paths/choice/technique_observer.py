@@ -19,7 +19,7 @@ class TechniqueObserver(Observer):
 
     Attributes:
         compares: Should the methods be given ``rivals``? They take three words of each stored
-            vertex. (They are ``()`` otherwise.)
+            vertex. (They are ``None`` otherwise.)
     """
 
     compares = False
@@ -36,7 +36,7 @@ class TechniqueObserver(Observer):
         t: mi.UInt32,
         value: mi.Spectrum,
         mis: mi.Float,
-        rivals: Rivals | tuple[()],
+        rivals: Rivals | None,
         active: mi.Bool,
     ) -> None:
         """The camera path in each lane was connected to a light path (s, t ≥ 2). This adds
@@ -48,14 +48,14 @@ class TechniqueObserver(Observer):
         position: mi.Point2f,
         value: mi.Spectrum,
         mis: mi.Float,
-        rivals: Rivals | tuple[()],
+        rivals: Rivals | None,
         active: mi.Bool,
     ) -> None:
         """Vertices of light paths were connected to the sensor (t = 1). This adds ``value``, the
         MIS weight ``mis`` included, at a position on the film (``Splats``)."""
 
     def merged(
-        self, value: mi.Spectrum, mis: mi.Float, rivals: Rivals | tuple[()], active: mi.Bool
+        self, value: mi.Spectrum, mis: mi.Float, rivals: Rivals | None, active: mi.Bool
     ) -> None:
         """The camera path in each lane was merged with a light path. This adds ``value`` to its
         radiance, the MIS weight ``mis`` included."""

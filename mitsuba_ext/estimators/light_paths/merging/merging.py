@@ -279,7 +279,7 @@ class MergedSubpaths(Subpaths):
         # Flux arrives per area of the surface; the value holds the shading cosine
         arrives = geometric_cosine(far, far.wi)
         value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
-        mis, rivals = mi.Float(1), ()
+        mis, rivals = mi.Float(1), None
         if self._sums is not None:
             reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
             ends = other.sums, pdf, vertex.path.sums, reverse

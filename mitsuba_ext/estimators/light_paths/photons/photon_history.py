@@ -30,7 +30,7 @@ class PhotonHistory:
         """At the next vertex."""
         return sums
 
-    def leave(self, sums, cosine, pdf, reverse_pdf, is_delta, is_first=False) -> Sums:
+    def leave(self, sums, cosine, pdf, reverse_pdf, is_delta, is_first, by_light) -> Sums:
         """Behind a vertex."""
         return replace(sums, dVCM=dr.select(is_delta, sums.dVCM, 1))
 

@@ -18,7 +18,6 @@ Quasi-Monte Carlo Methods 2004, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -50,15 +49,15 @@ class Link:
         plain: The same for the geometry term alone.
         connects: Was the last vertex connected to virtual lights, and left in a direction in which
             these could have been?
-        region: The region in which the last vertex lies; ``()`` if virtual lights are not chosen by
-            regions.
+        region: The region in which the last vertex lies; ``None`` if virtual lights are not chosen
+            by regions.
     """
 
     share: mi.Float
     kernel: mi.Float
     plain: mi.Float
     connects: mi.Bool
-    region: Any = ()
+    region: mi.UInt32 | None = None
 
 
 class Bound:
@@ -114,7 +113,7 @@ class Compensation(Weights):
         self.bound, self._selection = bound, selection
 
     def begin(self, ray):
-        region = () if self._selection is None else mi.UInt32(0)
+        region = None if self._selection is None else mi.UInt32(0)
         return Link(mi.Float(1), mi.Float(dr.inf), mi.Float(dr.inf), mi.Bool(False), region)
 
     def arrive(self, path, si):
@@ -128,7 +127,7 @@ class Compensation(Weights):
         leaves = dr.abs(dr.dot(arrival.ref.n, d)) * length
         kernel = dr.pi * arrival.pdf * cosine * inverse
         found = link.connects & si.is_valid()
-        region = ()
+        region = None
         if self._selection is not None:
             region = self._selection.region(from_both_ends(si), si.is_valid())
         return Link(

@@ -168,7 +168,7 @@ def _evaluated(
     exists = active & dr.isfinite(brightness) & dr.isfinite(albedo)
     brightness = dr.select(exists, brightness, 0)
     region = vertex.sums.region
-    region = mi.UInt32(0) if isinstance(region, tuple) else region
+    region = mi.UInt32(0) if region is None else region
     return (
         brightness * dr.select(exists, albedo, 0), brightness,
         dr.select(active, region, mi.UInt32(0)),

@@ -161,12 +161,12 @@ def _lights(
     return lights
 
 
-def _camera_vertices(scene: mi.Scene, sums: Any = ()) -> Vertex:
+def _camera_vertices(scene: mi.Scene, sums: Any = None) -> Vertex:
     """The same vertex in many lanes."""
     ray = mi.Ray3f(mi.Point3f(0.3, -1, 1), mi.Vector3f(0, 0.4, -1))
     si = scene.ray_intersect(ray)
     arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(True))
-    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), arrival, (), sums)
+    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), arrival, None, sums)
     return Vertex(si, si.bsdf(), path)
 
 

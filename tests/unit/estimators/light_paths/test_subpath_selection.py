@@ -187,8 +187,8 @@ def test_vertices_are_chosen_as_often_as_their_weights_say(adversarial: bool) ->
     numbers = mi.PCG32(size=draws)
     path = PathState(
         mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0),
-        Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), (),
-        Sums(mi.Float(0), mi.Float(0), dr.full(mi.UInt32, camera_region, draws), mi.Float(1)),
+        Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), None,
+        Sums(mi.Float(0), mi.Float(0), region=dr.full(mi.UInt32, camera_region, draws)),
     )  # fmt: skip
     vertex = Vertex(dr.zeros(mi.SurfaceInteraction3f, draws), None, path)
     pairs = [mi.Point2f(numbers.next_float32(), numbers.next_float32()) for _ in range(2)]
