@@ -9,6 +9,7 @@ import mitsuba as mi
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.estimators.light_paths.light_program import StoredHistory
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
 from mitsuba_ext.estimators.light_paths.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
@@ -124,7 +125,7 @@ class LightTracerIntegrator(WalkIntegrator):
 
     @property
     def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), 0, True)
+        layout = Layout(len(mi.Spectrum()), StoredHistory(), True)
         return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
 
     @property

@@ -18,6 +18,7 @@ from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_side import LightSide
+from ..estimators.light_paths.light_sums import LightSums, StoredSums
 from ..estimators.light_paths.light_vertices import Layout, bytes_per_vertex
 from ..estimators.light_paths.light_walk import STRIDE, LightWalk
 from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers
@@ -108,12 +109,13 @@ class LightPathIntegrator(WalkIntegrator):
         if self.merging is None:
             return None
         sums = PartialSums(
-            next_event or EmitterSampling(), dr.opaque(mi.Float, 1), splits=splits,
-            merging=dr.opaque(mi.Float, 1), light_paths=dr.opaque(mi.Float, 1),
+            dr.opaque(mi.Float, 1), splits=splits, merging=dr.opaque(mi.Float, 1),
+            light_paths=dr.opaque(mi.Float, 1),
             has_clear_curves=side.emission.has_clear_curves,
         )  # fmt: skip
         light_walk = LightWalk(
-            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
+            side.emission, self.max_depth, self.rr_depth,
+            LightSums(sums, next_event or EmitterSampling()), query=self.query(scene),
         )
         return self.merging.radius_of(
             scene, sensor, light_walk, not self.merges_all, self.samples_before
@@ -238,6 +240,6 @@ class Once:
 
 def _most_lanes(light_paths: float) -> int:
     """The most camera paths in a pass, with so many light paths for each."""
-    layout = Layout(len(mi.Spectrum()), 5, True)
+    layout = Layout(len(mi.Spectrum()), StoredSums(5), True)
     bytes_per_path = STRIDE * bytes_per_vertex(layout) + _LIGHT_BYTES
     return int(_PASS_BYTES / (light_paths * bytes_per_path + _CAMERA_BYTES))

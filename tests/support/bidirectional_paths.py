@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
+from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, weight
 from mitsuba_ext.estimators.light_paths.scattering import (
     cosine_of_delta,
@@ -160,7 +161,7 @@ def weights_of_techniques(
     ratios of the densities of these to its own, and the squared ratios of other connections and of
     the light image, [s − 2, 4, path]."""
     sums = PartialSums(
-        next_event, CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS
+        CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS
     )
     active = paths.active
     weights = BidirectionalWeights(scene, sums, emits, sensor)
@@ -169,7 +170,8 @@ def weights_of_techniques(
 
     # ----- Subpaths from the light -----
     si = vertices[0].from_light
-    first, at_first = sums.first(scene, emitted, si, active), mi.Bool(True)
+    first = LightSums(sums, next_event).at_first(scene, emitted, si, active)
+    at_first = mi.Bool(True)
     arrived = sums.arrive(first, si, mi.Float(1), at_first, by_light=True)
     by_light = [
         replace(first, region=arrived.region, count=arrived.count, by_kind=mi.Vector2f(0))

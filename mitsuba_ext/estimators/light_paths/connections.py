@@ -170,7 +170,7 @@ class LightSubpaths(Subpaths):
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         far_pdf = bsdf_density(far_bsdf, self._ctx, far, back, active)
         near_end = End(si, wo, pdf, reverse, vertex.path.sums)
-        far_end = End(far, back, far_pdf, far_reverse, other.sums)
+        far_end = End(far, back, far_pdf, far_reverse, other.history)
         mis = joining_weight(
             self._sums, near_end, far_end, squared_distance, chosen.expected
         )

@@ -127,10 +127,10 @@ class LightImage:
             # The density per area with which a camera ray finds the vertex, divided by the density
             # of this point of the aperture
             found = importance * geometric_cosine(si, to_camera)
-            others = self._sums.others(found, vertex.sums, reverse_pdf)
+            others = self._sums.others(found, vertex.history, reverse_pdf)
             mis = weight(others / self._sums.image_count)
             if self._sums.splits:
-                ends = found, vertex.sums, reverse_pdf, vertex.depth == 1
+                ends = found, vertex.history, reverse_pdf, vertex.depth == 1
                 kinds = self._sums.by_kind(*ends, by_light=True) / self._sums.image_count
                 rivals = Rivals(self._sums.by_camera(*ends), kinds)
             value *= mis

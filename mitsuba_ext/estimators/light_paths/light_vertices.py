@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .partial_sums import Sums
+from .light_program import StoredHistory
 from .stored_interaction import SHAPE_WORD, as_float, from_words, interaction_words, to_words
 
 #: A bit of the word that holds depth and region. It is set where only the hero wavelength of the
@@ -28,16 +28,13 @@ class Layout:
 
     Attributes:
         spectrum: Words of a spectrum.
-        sums: Words of the partial sums of MIS weights: 0, 2, or 5 (``Sums.by_camera``, and
-            ``Sums.by_kind`` of connections).
+        history: How the history of the path is stored.
         is_whole: Are all fields of the interaction stored?
-        has_region: Is the region stored in which the vertex lies?
     """
 
     spectrum: int
-    sums: int
+    history: StoredHistory
     is_whole: bool
-    has_region: bool = False
 
     @property
     def words(self) -> int:
@@ -46,8 +43,8 @@ class Layout:
 
     @property
     def mark(self) -> int:
-        """Index of the word that holds depth and region: it follows spectrum and sums."""
-        return self.spectrum + self.sums
+        """Index of the word that holds depth and region: it follows spectrum and history."""
+        return self.spectrum + self.history.word_count
 
 
 class VertexStore:
@@ -75,7 +72,7 @@ class VertexStore:
         slot: mi.UInt32,
         si: mi.SurfaceInteraction3f,
         β: mi.Spectrum,
-        sums: Sums,
+        history: Any,
         depth: mi.UInt32,
         hero_is_alone: mi.Bool | None,
         active: mi.Bool,
@@ -84,14 +81,10 @@ class VertexStore:
         mark = mi.UInt32(depth)
         if hero_is_alone is not None:
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
-        if self.layout.has_region:
-            mark |= sums.region << _DEPTH_BITS
-        words = [*β]
-        if self.layout.sums > 0:
-            words += [sums.last, sums.dVC]
-        if self.layout.sums > 2:
-            words += [*sums.by_camera, sums.by_kind.x]
-        words.append(as_float(mark))
+        stored = self.layout.history
+        if stored.has_region:
+            mark |= history.region << _DEPTH_BITS
+        words = [*β, *stored.words(history), as_float(mark)]
         words += to_words(si, self.layout.is_whole)
         words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), slot, active)
@@ -110,7 +103,7 @@ class LightVertex:
     Attributes:
         si: The interaction there. ``wi`` points to where the light path came from.
         β: Radiance · throughput / density of the path up to the vertex.
-        sums: Partial sums of the MIS weights (0 if none are stored).
+        history: What the :class:`LightProgram` knows of the path up to the vertex.
         depth: Segments between the light and the vertex; at least 1.
         hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
             light.
@@ -119,7 +112,7 @@ class LightVertex:
 
     si: mi.SurfaceInteraction3f
     β: mi.Spectrum
-    sums: Sums
+    history: Any
     depth: mi.UInt32
     hero_is_alone: mi.Bool | None
     lane: mi.UInt32
@@ -175,18 +168,11 @@ class LightVertices:
         w = dr.gather(
             mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
         )
-        sums = Sums(mi.Float(0), mi.Float(0))
-        if layout.sums > 0:
-            sums = Sums(w[n], w[n + 1])
-        if layout.sums > 2:
-            sums.by_camera = mi.Vector2f(w[n + 2], w[n + 3])
-            sums.by_kind = mi.Vector2f(w[n + 4], 0)
         mark = dr.reinterpret_array(mi.UInt32, w[layout.mark])
-        depth = mark & (_HERO_IS_ALONE - 1)
-        if layout.has_region:
-            depth, sums.region = _depth_and_region(mark)
-        if layout.sums > 0:
-            sums.is_caustic = (depth > 1) & (sums.dVCM == 0)
+        depth, region = mark & (_HERO_IS_ALONE - 1), None
+        if layout.history.has_region:
+            depth, region = _depth_and_region(mark)
+        history = layout.history.read([w[i] for i in range(n, layout.mark)], depth, region)
         lane = self._lane_of(slot, active)
         si = from_words([w[i] for i in range(layout.mark + 1, layout.words)], layout.is_whole)
         si.t = dr.select(active, mi.Float(0), dr.inf)
@@ -195,7 +181,7 @@ class LightVertices:
             si.wavelengths = self._of_lane(self._wavelengths, lane, active)
         hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else None
         β = mi.Spectrum(*(w[i] for i in range(n)))
-        return LightVertex(si, β, sums, depth, hero_is_alone, lane)
+        return LightVertex(si, β, history, depth, hero_is_alone, lane)
 
     def position(self, slot: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         """The positions of the vertices at these places of the store."""
@@ -206,15 +192,15 @@ class LightVertices:
         """The depths of the vertices at these places of the store."""
         word = slot * self._layout.words + self._layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
-        if self._layout.has_region:
+        if self._layout.history.has_region:
             return _depth_and_region(mark)[0]
         return mark & (_HERO_IS_ALONE - 1)
 
     def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Does light arrive from a delta lobe at the vertices at these places of the store?"""
         word = slot * self._layout.words + self._layout.spectrum
-        dVCM = dr.gather(mi.Float, self._words, word, active)
-        return (self.depth(slot, active) > 1) & (dVCM == 0)
+        first = dr.gather(mi.Float, self._words, word, active)
+        return (self.depth(slot, active) > 1) & (first == 0)
 
     def is_in_medium(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Do the vertices at these places of the store lie in participating media?"""
@@ -323,7 +309,7 @@ class VertexCache(PackedVertices):
 
     @property
     def region(self) -> mi.UInt32:
-        """The region in which each vertex lies. Only for layouts with ``has_region``."""
+        """The region in which each vertex lies. Only for histories with ``has_region``."""
         layout = self._layout
         index = dr.arange(mi.UInt32, self.count) * layout.words + layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))

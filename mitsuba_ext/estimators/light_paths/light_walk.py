@@ -21,10 +21,9 @@ from ...transport.vertex import Arrival, PathState, Vertex
 from .emission import EmittedRay, LightEmission
 from .light_directions import LightDirections
 from .light_media import medium_at_start
+from .light_program import LightProgram
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
-from .partial_sums import PartialSums, Sums
-from .photons.photon_history import PhotonHistory
-from .scattering import cosine_of_delta, delta_correction, evaluate, geometric_cosine
+from .scattering import delta_correction, evaluate
 
 #: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
 #: of all paths would take more than this number of bytes.
@@ -43,8 +42,8 @@ class LightPaths:
         emitted: Radiance / density of the emitted ray.
         β: Throughput up to the vertex, without emission.
         sampling_weight: See :class:`~mitsuba_ext.transport.vertex.PathState`.
-        sums: Partial sums of the MIS weights: at the first vertex, those of the vertex; later,
-            those of the direction that led to it (:meth:`PartialSums.leave`).
+        history: What the :class:`LightProgram` knows of the way: at the first vertex, that of the
+            vertex; later, that of the direction that led to it.
         depth: Segments between the light and the vertex.
         hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
             light.
@@ -58,7 +57,7 @@ class LightPaths:
     emitted: mi.Spectrum
     β: mi.Spectrum
     sampling_weight: mi.Float
-    sums: Sums
+    history: Any
     depth: mi.UInt32
     hero_is_alone: mi.Bool | None
     scatter_count: mi.UInt32
@@ -81,13 +80,12 @@ class LightWalk:
         max_depth: Longest path from light to sensor, in segments: vertices up to the depth
             ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
         rr_depth: Depth at which Russian roulette begins.
-        sums: Computes partial sums of MIS weights; ``None`` if they are not needed. In scenes with
-            media, a :class:`HiddenLight`.
+        program: Follows the paths for the estimator that uses their vertices.
         roulette: The Russian roulette. It is given the throughput without the light's power, since
             dim lights are already chosen rarely.
         query: Intersects rays with the scene.
         stored_lobes: Flags of BSDFs: vertices are stored where the BSDF has one of these
-            (``None``: a smooth one). For ``sums``, other vertices are as specular ones.
+            (``None``: a smooth one). For ``program``, other vertices are as specular ones.
         outside: The medium outside of all boundaries, in scenes with media (:func:`outer_medium`).
             ``None`` if paths pass through media as through a vacuum.
     """
@@ -95,7 +93,7 @@ class LightWalk:
     emission: LightEmission
     max_depth: int
     rr_depth: int
-    sums: PartialSums | PhotonHistory | None = None
+    program: LightProgram = field(default_factory=LightProgram)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
     stored_lobes: int | None = None
@@ -104,12 +102,8 @@ class LightWalk:
     @property
     def layout(self) -> Layout:
         """The layout of the stored vertices."""
-        sums, spectrum = self.sums, dr.size_v(mi.Spectrum)
         is_whole = self.emission.needs_whole_interaction
-        if sums is None:
-            return Layout(spectrum, 0, is_whole)
-        has_region = sums.selection is not None
-        return Layout(spectrum, 5 if sums.splits else 2, is_whole, has_region)
+        return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole)
 
     def begin(
         self,
@@ -139,16 +133,13 @@ class LightWalk:
             ray, inside = self._launch(scene, numbers, emitted, active)
             pi = self.query.closest(scene, ray, coherent=False, active=active)
             active &= self._media(scene).meets(pi, inside)
-            sums = Sums(mi.Float(0), mi.Float(0))
-            if self.sums is not None:
-                si = self.query.interaction(pi, emitted.ray)
-                sums = self.sums.first(scene, emitted, si, active)
+            history = self.program.first(scene, self.query, emitted, pi, active)
             width = dr.width(emitted.ray)
             # As wide as in later rounds, and in all renders: kernels would differ
             ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
             paths = LightPaths(
                 ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
-                dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
+                dr.full(mi.Float, 1, width), history, dr.full(mi.UInt32, 1, width),
                 Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
             )  # fmt: skip
             if paths.hero_is_alone is not None:
@@ -231,12 +222,13 @@ class LightWalk:
             si, β, in_medium = media.fly(paths.inside, numbers, paths.ray, si, paths.β, active)
             bsdf = si.bsdf(paths.ray)
             vertex = Vertex(si, bsdf, paths, None, in_medium)
-            sums = self._arrive(paths, si)
+            history = self.program.arrive(paths.history, si, paths.depth)
+            stores = self._stores(bsdf)
 
             # ----- Store the vertex if it can be connected -----
             store.write(
-                place, si, paths.emitted * media.arriving(β, vertex), sums, paths.depth,
-                paths.hero_is_alone, self._is_stored(media, vertex, active),
+                place, si, paths.emitted * media.arriving(β, vertex), history, paths.depth,
+                paths.hero_is_alone, active & self._is_stored(media, vertex, stores),
             )  # fmt: skip
             place += 1
 
@@ -244,12 +236,10 @@ class LightWalk:
             active_next = self._goes_on(media, vertex, last_depth, active)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
             bs, weight = directions.sample(bsdf, ctx, si, sample_1, sample_2, active_next)
-            weight, sums, hero_count, hero_is_alone = self._scatter(
-                heroes, paths, bsdf, si, bs, weight, sums, active_next
+            weight, history, hero_count, hero_is_alone = self._scatter(
+                heroes, vertex, bs, weight, history, stores, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
-            if dr.hint(media.exist and self.sums is not None, mode="scalar"):
-                sums = self.sums.scatter(sums, vertex, bs)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 
@@ -272,7 +262,7 @@ class LightWalk:
             scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
             active_next &= media.meets(pi, inside)
             paths = LightPaths(
-                ray, pi, paths.emitted, β, sampling_weight, sums, depth, hero_is_alone,
+                ray, pi, paths.emitted, β, sampling_weight, history, depth, hero_is_alone,
                 scatter_count, inside, active_next,
             )  # fmt: skip
             active = active_next & (place < end)
@@ -281,12 +271,7 @@ class LightWalk:
     def _directions(self) -> LightDirections:
         """The object that samples directions."""
         # MIS weights of camera paths make up for light that the samples of BSDFs do not find
-        return LightDirections(self.emission.not_reciprocal, mixes=not self._is_weighed)
-
-    @property
-    def _is_weighed(self) -> bool:
-        """Are light paths combined with camera paths by MIS weights?"""
-        return isinstance(self.sums, PartialSums)
+        return LightDirections(self.emission.not_reciprocal, mixes=not self.program.is_weighed)
 
     def _media(self, scene: mi.Scene) -> NoMedia:
         """The object that handles media."""
@@ -306,10 +291,9 @@ class LightWalk:
         inside.channel = inside.channel + dr.zeros(mi.UInt32, dr.width(medium))
         return media.launch(inside, numbers, rays, emitted.ray, active)
 
-    def _is_stored(self, media: NoMedia, vertex: Vertex, active) -> mi.Bool:
+    def _is_stored(self, media: NoMedia, vertex: Vertex, stores) -> mi.Bool:
         """Which vertices are stored?"""
-        stored = active & self._stores(vertex.bsdf)
-        return stored | vertex.medium.scatters if media.exist else stored
+        return stores | vertex.medium.scatters if media.exist else stores
 
     def _goes_on(self, media: NoMedia, vertex: Vertex, last_depth, active) -> mi.Bool:
         """Which paths may leave a vertex?"""
@@ -317,43 +301,19 @@ class LightWalk:
             return media.goes_on(vertex, self.max_depth, active)[0]
         return active & (vertex.depth < last_depth)
 
-    def _arrive(self, paths: LightPaths, si: mi.SurfaceInteraction3f) -> Sums:
-        """The partial sums at a vertex."""
-        if self.sums is None:
-            return paths.sums
-        is_first = paths.depth == 1
-        later = self.sums.arrive(paths.sums, si, dr.square(si.t), is_first, by_light=True)
-        return Sums(
-            dr.select(is_first, paths.sums.dVCM, later.dVCM),
-            dr.select(is_first, paths.sums.dVC, later.dVC),
-            later.by_camera,
-            later.region,
-            later.count,
-            ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else None,
-            later.by_kind,
-        )
-
-    def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):
-        """The weight of a BSDF sample, the partial sums behind it, the factor of the sampling
-        weight (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
+    def _scatter(self, heroes, vertex: Vertex, bs, weight, history, stores, active):
+        """The weight of a BSDF sample, the history behind it, the factor of the sampling weight
+        (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
+        bsdf, si, is_alone = vertex.bsdf, vertex.si, vertex.path.hero_is_alone
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        weight, hero_count, hero_is_alone = heroes.scatter(
-            paths.hero_is_alone, weight, bsdf, si, bs
-        )
-        value, reverse_pdf = evaluate(
-            heroes, paths.hero_is_alone, bsdf, si, bs.wo, active & ~is_delta
-        )
+        weight, hero_count, hero_is_alone = heroes.scatter(is_alone, weight, bsdf, si, bs)
+        value, reverse_pdf = evaluate(heroes, is_alone, bsdf, si, bs.wo, active & ~is_delta)
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
-        if self._is_weighed:
-            active &= self.sums.is_open(si, bs.wo)
-        if self.sums is not None and self.outside is None:
-            passes = is_delta | ~self._stores(bsdf)
-            cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
-            sums = self.sums.leave(
-                sums, cosine, bs.pdf, reverse_pdf, passes, paths.depth == 1, by_light=True
-            )
-        return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
+        active &= self.program.is_open(si, bs.wo)
+        passes = is_delta | ~stores
+        history = self.program.leave(history, vertex, bs, reverse_pdf, passes)
+        return dr.select(active, weight, 0), history, hero_count, hero_is_alone
 
     def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Are vertices with this BSDF stored?"""

@@ -9,17 +9,13 @@ MIS heuristic.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.path_decisions import EmitterSampling, SubpathSelection
+from ...transport.path_decisions import SubpathSelection
 from .both_ends import from_both_ends
 from .scattering import geometric_cosine
-
-if TYPE_CHECKING:
-    from .emission import EmittedRay
 
 
 @dataclass
@@ -77,8 +73,6 @@ class PartialSums:
     """Computes the sums along light paths and camera paths.
 
     Parameters:
-        next_event: The decision that samples points on lights for next event estimation at the
-            vertices of camera paths.
         connections: The average fraction of the vertices of a light path to which a vertex of a
             camera path is connected (s, t ≥ 2). Camera paths are connected to the light (s = 1) and
             hit it (s = 0) once.
@@ -98,7 +92,6 @@ class PartialSums:
 
     def __init__(
         self,
-        next_event: EmitterSampling,
         connections: mi.Float | float = 1.0,
         exponent: int = 2,
         splits: bool = False,
@@ -108,8 +101,7 @@ class PartialSums:
         light_paths: mi.Float | float = 1.0,
         has_clear_curves: bool = False,
     ) -> None:
-        self._next_event, self.exponent, self.selection = next_event, exponent, selection
-        self.splits = splits
+        self.exponent, self.splits, self.selection = exponent, splits, selection
         #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
         #: ``light_paths``, raised to the exponent.
@@ -140,26 +132,6 @@ class PartialSums:
     def root(self, ratio: mi.Float) -> mi.Float:
         """The inverse of :meth:`ratio`."""
         return dr.sqrt(ratio) if self.exponent == 2 else ratio
-
-    def first(
-        self, scene: mi.Scene, emitted: EmittedRay, si: mi.SurfaceInteraction3f, active: mi.Bool
-    ) -> Sums:
-        """At the first vertex after the light, ``si``."""
-        is_delta = emitted.is_delta_position | emitted.is_delta_direction
-        chosen = emitted.probability * emitted.pdf_position * emitted.pdf_direction
-        # Densities per area, at the vertex (``arrives``) and at the light (``leaves``)
-        arrives = chosen * _cosine(si) / dr.select(emitted.is_infinite, 1, dr.square(si.t))
-        connected = self._connection_density(scene, emitted, si, active)
-        leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
-        connected *= dr.select(is_delta, 1, leaves)
-        inverse = dr.select(arrives > 0, dr.rcp(arrives), 0)
-        sums = self.begin(
-            self.ratio(connected * inverse),
-            dr.select(is_delta, 0, self.ratio(leaves * inverse)),
-        )
-        if self.splits:
-            sums.by_camera = dr.zeros(mi.Vector2f, dr.width(inverse))
-        return sums
 
     def begin(self, dVCM: mi.Float, dVC: mi.Float) -> Sums:
         """The sums where a subpath begins."""
@@ -238,36 +210,6 @@ class PartialSums:
         ratio = self.ratio(cosine / squared_distance)
         return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * self.merging, 0)
 
-    def _connection_density(self, scene, emitted, si, active) -> mi.Float:
-        """The density with which next event estimation at ``si`` samples the point on the light:
-        per solid angle, or the probability of choosing the light if it is a point or a
-        direction."""
-        place = self._next_event.visit(
-            self._next_event.begin(None, emitted.ray), scene, si, active
-        )
-        # The density of the BSDF sample is not known here: decisions that use it cannot be combined
-        # with light paths
-        d = -emitted.ray.d
-        state = self._next_event.remember(place, scene, d, mi.Float(0), active)
-        start, ds = emitted.start, dr.zeros(mi.DirectionSample3f, dr.width(si))
-        ds.p, ds.n, ds.uv, ds.time = start.p, start.sh_frame.n, start.uv, si.time
-        ds.d, ds.dist, ds.emitter = -emitted.ray.d, si.t, emitted.emitter
-        ds.dist = dr.select(emitted.is_infinite, ds.dist, dr.norm(start.p - si.p))
-        ref = mi.Interaction3f(si)
-        is_delta = emitted.is_delta_position | (
-            emitted.is_delta_direction & emitted.is_infinite
-        )
-        is_beam = emitted.is_delta_direction & ~emitted.is_infinite
-        density = self._next_event.density(
-            state, scene, ref, start, ds, active & ~is_delta & ~is_beam
-        )
-        if not _has_delta(scene):
-            return density
-        probability = self._next_event.probability(
-            state, scene, ref, emitted.index, active & is_delta
-        )
-        return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
-
     def arrive(
         self,
         sums: Sums,
@@ -283,7 +225,7 @@ class PartialSums:
             is_first: Is ``si`` the first vertex of the subpath?
             by_light: Is it a light path?
         """
-        inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
+        inverse = dr.rcp(dr.maximum(arrival_cosine(si), 1e-12))
         region, count = None, None
         if self.selection is not None:
             region = self.selection.region(from_both_ends(si), si.is_valid())
@@ -387,11 +329,6 @@ def weight(others: mi.Float) -> mi.Float:
     return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
 
 
-def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
+def arrival_cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
     """Between the direction of arrival and the geometric normal."""
     return dr.abs(dr.dot(si.n, si.to_world(si.wi)))
-
-
-def _has_delta(scene: mi.Scene) -> bool:
-    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
-    return any(int(e.flags()) & delta for e in scene.emitters())

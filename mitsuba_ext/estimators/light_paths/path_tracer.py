@@ -23,6 +23,7 @@ from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
 from .light_numbers import LightPathRays
+from .light_sums import LightSums
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .merging.merging import HANDFUL, MergedSubpaths
@@ -110,9 +111,8 @@ class BidirectionalPathTracer:
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
             dr.make_opaque(merging)
         sums = PartialSums(
-            walk.next_event, dr.opaque(mi.Float, count), splits=splits,
-            selection=selection, merging=merging, merges_all=self.merges_all,
-            light_paths=dr.opaque(mi.Float, per_camera_path),
+            dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,
+            merges_all=self.merges_all, light_paths=dr.opaque(mi.Float, per_camera_path),
             has_clear_curves=self.emission.has_clear_curves,
         )  # fmt: skip
         image = None
@@ -122,8 +122,9 @@ class BidirectionalPathTracer:
                 scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
                 2 if self.skips_direct else 1, observer, per_camera_path,
             )  # fmt: skip
+        program = LightSums(sums, walk.next_event)
         light_walk = LightWalk(
-            self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
+            self.emission, walk.max_depth, walk.rr_depth, program, query=walk.query
         )
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)

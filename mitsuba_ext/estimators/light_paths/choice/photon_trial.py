@@ -23,9 +23,8 @@ from ....transport.numbers import Numbers, schedule_state
 from ....transport.walk import Walk
 from ....util.arrays import add_own, channel_mean
 from ....util.stored_arrays import StoredArrays
-from ..partial_sums import Sums
 from ..path_tracer import camera_paths
-from ..photons.photon_history import HiddenLight
+from ..photons.photon_history import HiddenLight, HiddenLightProgram
 from ..photons.photon_mapper import PhotonMapper
 from .candidates import Candidate
 from .light_paths import cost
@@ -128,7 +127,7 @@ class PhotonTrial(Trial):
         whole film."""
         self._mapper = mapper
         coarse = mapper.of_coarse_film(self._coarse.pixel_width)
-        light_walk = replace(coarse.light_walk, sums=HiddenLight())
+        light_walk = replace(coarse.light_walk, program=HiddenLightProgram())
         coarse = replace(coarse, light_walk=light_walk, observer=self._photons)
         return TrialPasses(walk, coarse, self._path)
 
@@ -258,13 +257,13 @@ class _Samples(TechniqueObserver):
         dr.eval(self._lane, self._importance, self._looked, self._moment, self._lost)
 
     def photon(
-        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
+        self, value: mi.Spectrum, carried: mi.Spectrum, history: HiddenLight, active: mi.Bool
     ) -> None:
         brought = channel_mean(value * self._importance)
-        hit = channel_mean(carried * self._importance) * sums.dVC
-        is_hidden = active & sums.is_caustic & dr.isfinite(brought * hit)
+        hit = channel_mean(carried * self._importance) * history.radiance
+        is_hidden = active & history.is_hidden & dr.isfinite(brought * hit)
         add_own(self._moment, brought * hit, self._lane, is_hidden)
-        add_own(self._lost, brought, self._lane, is_hidden & (sums.dVC == 0))
+        add_own(self._lost, brought, self._lane, is_hidden & (history.radiance == 0))
 
     def searched(self, count: mi.UInt32) -> None:
         add_own(self._looked, count, self._lane)

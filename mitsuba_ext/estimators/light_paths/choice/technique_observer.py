@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
 from ....transport.observer import Observer, Observers
-from ..partial_sums import Rivals, Sums
+from ..partial_sums import Rivals
 from .candidates import Available
 
 
@@ -61,12 +61,12 @@ class TechniqueObserver(Observer):
         radiance, the MIS weight ``mis`` included."""
 
     def photon(
-        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
+        self, value: mi.Spectrum, carried: mi.Spectrum, history: Any, active: mi.Bool
     ) -> None:
-        """The camera path in each lane was merged with a vertex of a light path, whose partial sums
-        are ``sums``; merging is the only technique. This adds ``value`` to its radiance.
-        ``carried`` is the flux of the light path, times the throughput of the camera path if it
-        goes on along the light path."""
+        """The camera path in each lane was merged with a vertex of a light path, whose history
+        (:class:`LightProgram`) is given; merging is the only technique. This adds ``value`` to its
+        radiance. ``carried`` is the flux of the light path, times the throughput of the camera path
+        if it goes on along the light path."""
 
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, so many vertices were looked at."""

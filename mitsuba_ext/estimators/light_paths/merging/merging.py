@@ -282,7 +282,7 @@ class MergedSubpaths(Subpaths):
         mis, rivals = mi.Float(1), None
         if self._sums is not None:
             reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-            ends = other.sums, pdf, vertex.path.sums, reverse
+            ends = other.history, pdf, vertex.path.sums, reverse
             mis = self._sums.merging_weight(*ends)
             value *= mis
             if self._sums.splits:
@@ -293,7 +293,7 @@ class MergedSubpaths(Subpaths):
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:
                 carried = value * vertex.path.β * (arrives / pdf)
-                self._observer.photon(brought, carried, other.sums, active & (pdf > 0))
+                self._observer.photon(brought, carried, other.history, active & (pdf > 0))
             else:
                 self._observer.merged(brought, mis, rivals, active)
         return dr.select(active, value, 0)

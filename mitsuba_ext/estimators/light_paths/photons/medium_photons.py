@@ -137,7 +137,7 @@ class MergedInMedia(MergedSubpaths):
                 gathered += value
                 if dr.hint(self._observer is not None, mode="scalar"):
                     carried = path.β * σ_s * other.β
-                    self._observer.photon(value * weight, carried, other.sums, exists)
+                    self._observer.photon(value * weight, carried, other.history, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
@@ -159,7 +159,7 @@ class MergedInMedia(MergedSubpaths):
             )
             brought = value * vertex.path.β * self._per_vertex
             carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
-            self._observer.photon(brought, carried, other.sums, active)
+            self._observer.photon(brought, carried, other.history, active)
         return value
 
     def _flux(

@@ -121,7 +121,7 @@ class PhotonDirections(Scattering):
         """Where a photon has come from (local at ``vertex``), and its power: 0 if it does not
         count."""
         d = vertex.si.to_local(other.si.to_world(other.si.wi))
-        counts = active & (other.depth > 1) & (other.sums.dVCM != 0)
+        counts = active & (other.depth > 1) & (other.history.scattered != 0)
         counts &= d.z * vertex.si.wi.z > 0
         power = dr.max(mi.unpolarized_spectrum(other.β))
         return d, dr.select(counts & dr.isfinite(power), power, 0)

@@ -2,77 +2,125 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from ....transport.path_decisions import SubpathSelection
-from ....transport.vertex import Vertex
 from ..both_ends import from_both_ends
-from ..partial_sums import Sums
+from ..light_program import LightProgram, StoredHistory
 
 
+@dataclass
 class PhotonHistory:
-    """Tells the photons of caustics, in the place of :class:`PartialSums`: those that have met
-    nothing but mirrors, glass and other surfaces that store no photons. Their ``dVCM`` is 0, as it
-    is behind delta lobes; that of others is 1.
+    """What a photon remembers.
+
+    Attributes:
+        scattered: 0 if the photon has met nothing but mirrors, glass and other surfaces that store
+            no photons; 1 otherwise.
     """
 
-    selection, splits, merging = None, False, None
-
-    def first(self, scene, emitted, si, active) -> Sums:
-        """At the first vertex after the light."""
-        lanes = dr.width(emitted.ray)
-        return Sums(dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes))
-
-    def arrive(self, sums, si, squared_distance, is_first, by_light) -> Sums:
-        """At the next vertex."""
-        return sums
-
-    def leave(self, sums, cosine, pdf, reverse_pdf, is_delta, is_first, by_light) -> Sums:
-        """Behind a vertex."""
-        return replace(sums, dVCM=dr.select(is_delta, sums.dVCM, 1))
+    scattered: mi.Float
 
 
-class VertexRegions(PhotonHistory):
+class _StoredPhoton(StoredHistory):
+    def words(self, history: PhotonHistory) -> list[mi.Float]:
+        return [history.scattered]
+
+    def read(self, words, depth, region) -> PhotonHistory:
+        return PhotonHistory(words[0])
+
+
+class PhotonProgram(LightProgram):
+    """Tells the photons of caustics."""
+
+    stored = _StoredPhoton(word_count=1)
+
+    def first(self, scene, query, emitted, pi, active) -> PhotonHistory:
+        return PhotonHistory(dr.zeros(mi.Float, dr.width(emitted.ray)))
+
+    def leave(self, history: PhotonHistory, vertex, bs, reverse_pdf, passes) -> PhotonHistory:
+        return PhotonHistory(dr.select(passes, history.scattered, 1))
+
+
+@dataclass
+class RegionHistory:
+    """
+    Attributes:
+        region: The region in which the last vertex lies.
+    """
+
+    region: mi.UInt32
+
+
+class _StoredRegion(StoredHistory):
+    def read(self, words, depth, region) -> RegionHistory:
+        return RegionHistory(region)
+
+
+class RegionProgram(LightProgram):
     """Tells the region in which each vertex lies.
 
     Parameters:
         selection: Divides surfaces into regions.
     """
 
+    stored = _StoredRegion(has_region=True)
+
     def __init__(self, selection: SubpathSelection) -> None:
-        self.selection = selection
+        self._selection = selection
 
-    def first(self, scene, emitted, si, active) -> Sums:
-        sums = super().first(scene, emitted, si, active)
-        sums.region = dr.zeros(mi.UInt32, dr.width(emitted.ray))
-        sums.count = dr.full(mi.Float, 1, dr.width(emitted.ray))
-        return sums
+    def first(self, scene, query, emitted, pi, active) -> RegionHistory:
+        return RegionHistory(dr.zeros(mi.UInt32, dr.width(emitted.ray)))
 
-    def arrive(self, sums, si, squared_distance, is_first, by_light) -> Sums:
-        return replace(sums, region=self.selection.region(from_both_ends(si), si.is_valid()))
+    def arrive(self, history, si, depth) -> RegionHistory:
+        return RegionHistory(self._selection.region(from_both_ends(si), si.is_valid()))
 
 
-class HiddenLight(PhotonHistory):
-    """Tells the photons that only a camera path which hits the light can find too, in scenes with
-    media: those that left the light by way of mirrors or clear glass, so that no connection leads
-    there. Their ``dVCM`` is 0, that of others is 1. ``dVC`` is radiance / power of the emitted ray:
-    the radiance that such a camera path finds, in units of what the photon carries; 0 of lights
-    that it cannot hit.
+@dataclass
+class HiddenLight:
+    """What a photon remembers of its light.
+
+    Attributes:
+        connectable: 0 if the photon left the light by way of a mirror or clear glass, so that no
+            connection leads there: only a camera path that hits the light can find the photon too.
+            1 otherwise.
+        radiance: The radiance that such a camera path finds, in units of what the photon carries:
+            radiance / power of the emitted ray. 0 for lights that no path can hit.
     """
 
-    def first(self, scene, emitted, si, active) -> Sums:
+    connectable: mi.Float
+    radiance: mi.Float
+
+    @property
+    def is_hidden(self) -> mi.Bool:
+        """Whether no connection finds the photon."""
+        return self.connectable == 0
+
+
+class _StoredHiddenLight(StoredHistory):
+    def words(self, history: HiddenLight) -> list[mi.Float]:
+        return [history.connectable, history.radiance]
+
+    def read(self, words, depth, region) -> HiddenLight:
+        return HiddenLight(*words)
+
+
+class HiddenLightProgram(LightProgram):
+    """Tells the photons of hidden lights, in scenes with media."""
+
+    stored = _StoredHiddenLight(word_count=2)
+
+    def first(self, scene, query, emitted, pi, active) -> HiddenLight:
         density = emitted.probability * emitted.pdf_position * emitted.pdf_direction
         density *= dr.select(emitted.cosine > 0, dr.rcp(emitted.cosine), 0)
         is_delta = emitted.is_delta_position | emitted.is_delta_direction
         one = dr.full(mi.Float, 1, dr.width(emitted.ray))
-        return Sums(one, dr.select(is_delta, 0, density))
+        return HiddenLight(one, dr.select(is_delta, 0, density))
 
-    def scatter(self, sums: Sums, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
-        """Behind a vertex, which may lie in a medium."""
+    def leave(self, history: HiddenLight, vertex, bs, reverse_pdf, passes) -> HiddenLight:
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & ~vertex.medium.scatters
-        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        is_hidden = (vertex.depth == 1) & is_delta & ~passes
-        return replace(sums, dVCM=dr.select(is_hidden, 0, sums.dVCM))
+        is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        is_hidden = (vertex.depth == 1) & is_delta & ~is_null
+        return HiddenLight(dr.select(is_hidden, 0, history.connectable), history.radiance)

@@ -21,6 +21,7 @@ from ....transport.path_decisions import Roulette, Weights
 from ....transport.walk import Walk
 from ..choice.technique_observer import TechniqueObserver
 from ..light_numbers import LightPathRays
+from ..light_program import StoredHistory
 from ..light_vertices import Layout, LightVertices, PackedVertices, VertexCache, bytes_per_vertex
 from ..light_walk import STRIDE, LightWalk
 from ..merging.merging import MergedSubpaths
@@ -35,7 +36,7 @@ _PASS_BYTES, _PATH_BYTES = 1 << 29, 512
 
 def most_lanes(light_paths: float) -> int:
     """The most camera paths in a pass, with so many light paths for each."""
-    layout = Layout(len(mi.Spectrum()), 0, True)
+    layout = Layout(len(mi.Spectrum()), StoredHistory(), True)
     bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
     return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
 

@@ -25,7 +25,7 @@ from ..light_vertices import LightVertices, PackedVertices, VertexCache
 from ..light_walk import LightWalk
 from ..merging.merging import MergedSubpaths, disk_radius, scene_diagonal
 from ..merging.vertex_grid import VertexGrid
-from .photon_history import PhotonHistory
+from .photon_history import PhotonProgram
 from .photon_phases import BEFORE, is_diffuse
 
 #: The radii of a map: how many, and the ratio of one to the one before. Where the search for a
@@ -139,7 +139,7 @@ class PhotonMaps:
 
 def photon_walk(light_walk: LightWalk) -> LightWalk:
     """The walk, made to store photons: on diffuse surfaces, with what tells caustics."""
-    light_walk.sums = PhotonHistory()
+    light_walk.program = PhotonProgram()
     light_walk.stored_lobes = mi.BSDFFlags.Diffuse
     return light_walk
 

@@ -15,7 +15,7 @@ from ....transport.path_decisions import SubpathSelection
 from ....transport.walk import Walk
 from ..light_walk import LightWalk
 from ..path_tracer import camera_paths
-from ..photons.photon_history import VertexRegions
+from ..photons.photon_history import RegionProgram
 from .virtual_light_bound import Bound, Compensation, EndsWithItsShare
 from .virtual_light_choice import LearnedChoice, UniformChoice, VirtualLightChoice
 from .virtual_light_connections import VirtualLightConnections
@@ -72,7 +72,7 @@ class InstantRadiosity:
         selection = self.selection if self.selection.count > 0 else None
         light_walk = self.light_walk
         if selection is not None:
-            light_walk = replace(light_walk, sums=VertexRegions(selection))
+            light_walk = replace(light_walk, program=RegionProgram(selection))
         set_count = self.sets.count(lanes)
         lights, scatter_count = VirtualLights.trace(
             scene, light_walk, sampler, rays, set_count, self.sets.paths

@@ -167,8 +167,7 @@ def _evaluated(
     brightness = dr.sum(dr.abs(vertex.β))
     exists = active & dr.isfinite(brightness) & dr.isfinite(albedo)
     brightness = dr.select(exists, brightness, 0)
-    region = vertex.sums.region
-    region = mi.UInt32(0) if region is None else region
+    region = mi.UInt32(0) if vertex.history is None else vertex.history.region
     return (
         brightness * dr.select(exists, albedo, 0), brightness,
         dr.select(active, region, mi.UInt32(0)),

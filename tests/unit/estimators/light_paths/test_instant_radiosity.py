@@ -12,8 +12,9 @@ import pytest
 from scipy import stats
 
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_program import LightProgram
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
-from mitsuba_ext.estimators.light_paths.photons.photon_history import VertexRegions
+from mitsuba_ext.estimators.light_paths.photons.photon_history import RegionProgram
 from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_bound import Link
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_choice import (
@@ -155,8 +156,8 @@ def _lights(
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4 * paths)
     rays = CameraRays(dr.zeros(mi.RayDifferential3f, 4 * paths))
-    sums = VertexRegions(table) if table is not None else None
-    walk = LightWalk(LightEmission(scene), 5, 5, sums)
+    program = RegionProgram(table) if table is not None else LightProgram()
+    walk = LightWalk(LightEmission(scene), 5, 5, program)
     lights, _ = VirtualLights.trace(scene, walk, sampler, rays, 2, paths)
     return lights
 

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.light_vertices import PackedVertices, VertexCache
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
@@ -157,8 +158,8 @@ def _table_and_vertices(adversarial: bool) -> tuple[RegionTable, VertexCache]:
     numbers.seed(1, lanes)
 
     def vertices(selection: RegionTable | None) -> VertexCache:
-        walk = LightWalk(LightEmission(scene), 5, 5,
-                         PartialSums(EmitterSampling(), selection=selection))  # fmt: skip
+        program = LightSums(PartialSums(selection=selection), EmitterSampling())
+        walk = LightWalk(LightEmission(scene), 5, 5, program)
         rounds: list[PackedVertices] = []
         walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths,
                  dr.full(mi.Bool, True, lanes),

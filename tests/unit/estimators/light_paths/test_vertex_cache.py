@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.light_vertices import (
     LightVertices,
     PackedVertices,
@@ -27,7 +28,7 @@ def _rounds(scene: mi.Scene, stride: int) -> list[LightVertices]:
     """The same paths, with ``stride`` vertices stored at a time."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, LANES)
-    walk = LightWalk(LightEmission(scene), DEPTH, 100, PartialSums(EmitterSampling()))
+    walk = LightWalk(LightEmission(scene), DEPTH, 100, LightSums(PartialSums(), EmitterSampling()))
     paths = walk.begin(scene, sampler, mi.Float(0), mi.Color0f(), mi.Bool(True))
     rounds = []
     while dr.any(paths.active)[0]:
@@ -38,8 +39,8 @@ def _rounds(scene: mi.Scene, stride: int) -> list[LightVertices]:
 
 def _words(cache: VertexCache) -> list[np.ndarray]:
     vertex = cache.at(dr.arange(mi.UInt32, cache.count), mi.Bool(True))
-    columns = [vertex.si.p, vertex.si.wi, vertex.si.uv, vertex.β, vertex.sums.dVCM, vertex.sums.dVC,
-               vertex.depth, vertex.lane]  # fmt: skip
+    si, sums = vertex.si, vertex.history
+    columns = [si.p, si.wi, si.uv, vertex.β, sums.dVCM, sums.dVC, vertex.depth, vertex.lane]
     return [column.numpy() for column in columns]
 
 
