@@ -12,7 +12,7 @@ import mitsuba as mi
 from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.staged_integrator import NO_LIMIT
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.estimators.caches.cached_light import CachedLight, CameraPhases, EndsAtTheCache
+from mitsuba_ext.estimators.caches.cached_light import CachedLight
 from mitsuba_ext.estimators.caches.gathering import Gatherer
 from mitsuba_ext.estimators.caches.hemisphere import Strata
 from mitsuba_ext.estimators.caches.irradiance_rounds import CacheParameters, CacheRounds, deadline
@@ -207,10 +207,7 @@ class IrradianceCache(WalkIntegrator):
         if observer is not None or self.max_depth < 3 or not scene.emitters():
             return walk
         grid = self._cached(scene, sensor, walk)
-        return replace(
-            walk, rr_depth=0, roulette=EndsAtTheCache(self.rr_depth), mis=CameraPhases(),
-            subpaths=CachedLight(grid, self.max_depth, can_be_hit(scene)),
-        )  # fmt: skip
+        return replace(walk, program=CachedLight(grid, self.max_depth, can_be_hit(scene)))
 
     def _cached(self, scene: mi.Scene, sensor: mi.Sensor, walk: Walk) -> RecordGrid:
         """Makes the records that the view needs."""

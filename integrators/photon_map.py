@@ -14,19 +14,18 @@ from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
+from mitsuba_ext.estimators.light_paths.photons.gathering_paths import (
+    ENDED,
+    GATHERS_ON,
+    GatheringPaths,
+    first_vertex,
+    is_diffuse,
+)
 from mitsuba_ext.estimators.light_paths.photons.photon_directions import PhotonDirections
 from mitsuba_ext.estimators.light_paths.photons.photon_maps import (
     PhotonMaps,
     PhotonSubpaths,
     photon_walk,
-)
-from mitsuba_ext.estimators.light_paths.photons.photon_phases import (
-    ENDED,
-    GATHERS_ON,
-    EndsWithTheGather,
-    Phases,
-    first_vertex,
-    is_diffuse,
 )
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
@@ -195,13 +194,9 @@ class PhotonMapping(WalkIntegrator):
         last = ENDED if self.final_gather else GATHERS_ON
         if self.guided and self.maps.gathered is not None:
             decisions = replace(decisions, scattering=PhotonDirections(self.maps))
-        return replace(
-            self.walk(decisions, observer), mis=Phases(), rr_depth=0,
-            roulette=EndsWithTheGather(self.rr_depth, last),
-            subpaths=PhotonSubpaths(
-                *self.maps.estimates(scene, self.max_depth), self.final_gather
-            ),
-        )  # fmt: skip
+        photons = PhotonSubpaths(*self.maps.estimates(scene, self.max_depth), self.final_gather)
+        program = GatheringPaths(photons, last)
+        return replace(self.walk(decisions, observer), program=program)
 
     def aov_names(self) -> list[str]:
         if not self.photon_aovs:

@@ -27,7 +27,7 @@ from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import with_recordings
-from ..transport.path_decisions import Weights
+from ..transport.path_program import PathProgram
 from ..transport.walk import Walk
 from ..util.parameters import MOST_SPP
 from .walk_integrator import WalkIntegrator
@@ -161,11 +161,12 @@ class ChainIntegrator(WalkIntegrator):
         )
 
     def composed_walk(
-        self, setting: Setting, max_depth: int, mis: Weights | None = None
+        self, setting: Setting, max_depth: int, program: PathProgram | None = None
     ) -> Walk:
-        """A walk with this integrator's decisions, and these MIS weights where it has none."""
-        given = Decisions(query=self.query(setting.scene), mis=mis)
-        return replace(self.walk(decisions_of(self.slots, setting, given)), max_depth=max_depth)
+        """A walk with this integrator's decisions; ``program`` follows its paths."""
+        given = Decisions(query=self.query(setting.scene))
+        walk = self.walk(decisions_of(self.slots, setting, given))
+        return replace(walk, max_depth=max_depth, program=program or PathProgram())
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         start = time.perf_counter()

@@ -15,7 +15,7 @@ from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..planning.technique import Setting, Technique
 from ..startup.registry import variant_bound
-from ..transport.path_decisions import Weights
+from ..transport.path_program import PathProgram
 from ..transport.without_lengths import WithoutLengths
 from .chain_integrator import ChainIntegrator
 from .slots import read_slot
@@ -71,8 +71,8 @@ class MetropolisIntegrator(ChainIntegrator):
         if not scene.emitters() or self.max_depth < least:
             return None
         if not self.bidirectional or self.max_depth < 2:
-            weights = WithoutLengths(Weights(), 1, 2) if self.finds_direct else Weights()
-            walk = self.composed_walk(setting, self.max_depth, mis=weights)
+            program = WithoutLengths(PathProgram(), 1, 2) if self.finds_direct else None
+            walk = self.composed_walk(setting, self.max_depth, program)
             return ImageTarget(scene, sensor, walk, setting.spp)
         side = LightSide.of(self.name, scene, sensor)
         walk = self.composed_walk(setting, self.max_depth)

@@ -13,7 +13,7 @@ from ..estimators.light_paths.light_side import LightSide
 from ..planning.technique import Setting
 from ..rendering.stages import OneStage
 from ..scene.bsdfs import refuse_clear_curves
-from ..transport.path_decisions import Weights
+from ..transport.path_program import PathProgram
 from ..transport.without_lengths import WithoutLengths
 
 #: Segments of the longest paths that chains sample: the memory of each chain grows with it.
@@ -61,8 +61,8 @@ def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTa
 def camera_samples(integrator: Any, setting: Setting) -> OneStage:
     """The camera samples: they find direct light, and all light on paths that are longer than
     those that chains sample."""
-    weights = WithoutLengths(Weights(), _least(integrator), MOST)
-    return OneStage(integrator.composed_walk(setting, setting.max_depth, mis=weights))
+    program = WithoutLengths(PathProgram(), _least(integrator), MOST)
+    return OneStage(integrator.composed_walk(setting, setting.max_depth, program))
 
 
 def _least(integrator: Any) -> int:

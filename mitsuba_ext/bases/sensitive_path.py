@@ -19,7 +19,6 @@ from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
-from ..transport.path_decisions import Weights
 from ..transport.sensitivity import Sensitivity
 from .remembering_path import RememberingPath
 
@@ -80,7 +79,7 @@ class SensitivePath(RememberingPath):
         self, scene: mi.Scene, sensor: mi.Sensor, learning: LearningPlan
     ) -> Callable[[Decisions, Observer | None], Estimator]:
         def sensitive(decisions: Decisions, observer: Observer | None = None) -> Estimator:
-            weights = Sensitivity(decisions.mis or Weights(), self._optimized)
-            return self.walk(replace(decisions, mis=weights), observer)
+            walk = self.walk(decisions, observer)
+            return replace(walk, program=Sensitivity(self._optimized))
 
         return sensitive

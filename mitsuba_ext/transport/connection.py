@@ -21,6 +21,7 @@ from .path_decisions import (
     ShadowTest,
     Weights,
 )
+from .path_program import PathProgram
 from .replay import Replay
 from .vertex import Vertex
 
@@ -47,7 +48,7 @@ class Connection:
 class Connector:
     """Connects vertices to lights: chooses points, traces shadow rays, and applies MIS weights.
 
-    The parameters are the decisions of the walk that take part in it.
+    The parameters are the decisions of the walk that take part in it, and its program.
     """
 
     def __init__(
@@ -60,12 +61,14 @@ class Connector:
         query: SceneQuery,
         heroes: Heroes,
         weights: Weights,
+        program: PathProgram,
         observer: Observer,
         media: NoMedia,
         replay: Replay | None = None,
     ) -> None:
         self._media, self._replay = media, replay
-        self._scene, self._query, self._heroes, self._weights = scene, query, heroes, weights
+        self._scene, self._query, self._heroes = scene, query, heroes
+        self._weights, self._program = weights, program
         self._next_event, self._connections = next_event, connections
         self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
         #: Has any vertex one connection, and has any more than one?
@@ -127,13 +130,15 @@ class Connector:
         """
         si, ds = vertex.si, connection.ds
         bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
-        mis = self._weights.connection(self._scene, vertex, ds, count * ds.pdf, pdf)
+        mis = self._program.connection(
+            self._weights, self._scene, vertex, ds, count * ds.pdf, pdf
+        )
         contribution = bsdf_value * connection.weight
         value = β * contribution * mis
         considered = active & (ds.pdf != 0)
         # A connection that cannot contribute needs no shadow ray
         tested = considered & (dr.max(dr.abs(value)) > 0)
-        worth = self._weights.worth(vertex, ds)
+        worth = self._program.worth(vertex, ds)
         value, contribution = value * worth, contribution * worth
         if self._replay is not None:
             tested = considered  # its derivative need not be zero

@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from .path_decisions import EmitterSampling, SceneQuery, Weights
+from .path_program import PathProgram
 from .vertex import PathState
 
 
@@ -18,6 +19,7 @@ def emission(
     next_event: EmitterSampling,
     state: Any,
     weights: Weights,
+    program: PathProgram,
     count: mi.Float | float = 1.0,
 ) -> tuple[mi.Spectrum, mi.Float, mi.DirectionSample3f, mi.Float]:
     """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the previous
@@ -28,7 +30,7 @@ def emission(
         query: The decision that found ``si``.
         next_event, state: The decision whose connections could have found the light as well, and
             its state when the path left the previous vertex.
-        weights: The MIS weights.
+        weights, program: What weighs scattering against connections and other techniques.
         count: Number of connections of the previous vertex.
     """
     arrival = path.arrival
@@ -36,7 +38,7 @@ def emission(
     ds.emitter = query.emitter(si, ds.emitter)
     is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
     pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
-    weight = weights.emission(scene, si, ds, path, count * pdf)
+    weight = program.emission(weights, scene, si, ds, path, count * pdf)
     return ds.emitter.eval(si, arrival.pdf > 0) * weight, weight, ds, pdf
 
 

@@ -205,8 +205,7 @@ class ConnectionCount:
 
 class Weights:
     """The MIS weights of the two ways in which a path finds light: connections to lights, and
-    scattered rays that hit lights. Where other techniques can find the same light, ``sums`` of the
-    path hold what their weights need.
+    scattered rays that hit lights.
 
     Parameters:
         heuristic: Weighs these two against each other.
@@ -215,56 +214,27 @@ class Weights:
     def __init__(self, heuristic: Heuristic = power_heuristic) -> None:
         self._heuristic = heuristic
 
-    def begin(self, ray: mi.Ray3f) -> Any:
-        """The sums before the first vertex."""
-        return None
-
-    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
-        """The sums at the vertex ``si``; ``path`` holds those of :meth:`leave` at the last one."""
-        return path.sums
-
-    def emission(
-        self,
-        scene: mi.Scene,
-        si: mi.SurfaceInteraction3f,
-        ds: mi.DirectionSample3f,
-        path: PathState,
-        pdf: mi.Float,
-    ) -> mi.Float:
-        """The weight of light at ``si`` that the path has hit in the direction ``ds``. ``pdf`` is
-        the density with which connections find it, times their number."""
-        return self._heuristic(path.arrival.pdf, pdf)
+    def emission(self, scattering_pdf: mi.Float, pdf: mi.Float) -> mi.Float:
+        """The weight of light that scattering has found with the density ``scattering_pdf``.
+        ``pdf`` is the density with which connections find it, times their number."""
+        return self._heuristic(scattering_pdf, pdf)
 
     def connection(
-        self,
-        scene: mi.Scene,
-        vertex: Vertex,
-        ds: mi.DirectionSample3f,
-        pdf: mi.Float,
-        scattering_pdf: mi.Float,
+        self, ds: mi.DirectionSample3f, pdf: mi.Float, scattering_pdf: mi.Float
     ) -> mi.Float:
         """The weight of a connection to the light sample ``ds``. ``pdf`` is its density times the
         number of connections, ``scattering_pdf`` the density with which scattering finds it."""
         return dr.select(ds.delta, 1, self._heuristic(pdf, scattering_pdf))
-
-    def worth(self, vertex: Vertex, ds: mi.DirectionSample3f) -> mi.Float | float:
-        """How much the light of a connection counts, where not all light counts the same.
-        :meth:`emission` contains this factor."""
-        return 1.0
-
-    def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
-        """The sums after ``vertex``, in the direction that was sampled there."""
-        return vertex.path.sums
 
 
 class ScatteringAlone(Weights):
     """Uses scattering alone: connections have weight 0, except to light that scattering cannot
     find."""
 
-    def emission(self, scene, si, ds, path, pdf):
-        return dr.select(path.arrival.pdf > 0, mi.Float(1), 0)
+    def emission(self, scattering_pdf, pdf):
+        return dr.select(scattering_pdf > 0, mi.Float(1), 0)
 
-    def connection(self, scene, vertex, ds, pdf, scattering_pdf):
+    def connection(self, ds, pdf, scattering_pdf):
         return dr.select(ds.delta | ~(scattering_pdf > 0), mi.Float(1), 0)
 
 
@@ -272,10 +242,10 @@ class ConnectionsAlone(Weights):
     """Uses connections alone: light that a path hits has weight 0, except where no connection can
     find it."""
 
-    def emission(self, scene, si, ds, path, pdf):
+    def emission(self, scattering_pdf, pdf):
         return dr.select(pdf > 0, mi.Float(0), 1)
 
-    def connection(self, scene, vertex, ds, pdf, scattering_pdf):
+    def connection(self, ds, pdf, scattering_pdf):
         return mi.Float(1)
 
 
@@ -316,44 +286,6 @@ class SubpathSelection:
                 are not chosen.
         """
         raise NotImplementedError
-
-
-class Subpaths:
-    """Connects vertices to those of subpaths that another walk has stored. A walk may have none."""
-
-    def gather(
-        self, scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """The radiance that the connections of a vertex add to the path, throughput included, and
-        the number of shadow rays."""
-        raise NotImplementedError
-
-    def along(
-        self,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        si: mi.SurfaceInteraction3f,
-        inside: Any,
-        path: PathState,
-        active: mi.Bool,
-    ) -> mi.Spectrum | float:
-        """The radiance that they add on the way of a path to the surface ``si``, throughput
-        included, where the state of the path in participating media is ``inside``."""
-        return 0.0
-
-    def beyond(
-        self,
-        vertex: Vertex,
-        bs: mi.BSDFSample3f,
-        β: mi.Spectrum,
-        sums: Any,
-        active: mi.Bool,
-    ) -> tuple[mi.Spectrum | float, Any]:
-        """The radiance that is known of the direction in which a path leaves ``vertex``, throughput
-        included, and the sums of MIS weights after it, which may exclude what is known from the
-        rest of the path. ``β`` is the throughput in that direction, ``sums`` are from
-        :meth:`Weights.leave`."""
-        return 0.0, sums
 
 
 class ShadowTest:

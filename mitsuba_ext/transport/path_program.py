@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from .path_decisions import Roulette, Weights
@@ -16,8 +17,8 @@ from .vertex import PathState, Vertex
 
 
 class Subpaths:
-    """Other subpaths, which bring light to the vertices of a path: those of light paths that another
-    walk has stored."""
+    """Other subpaths, which bring light to the vertices of a path: light paths that another walk
+    has stored."""
 
     def gather(
         self, scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
@@ -143,3 +144,14 @@ class PathProgram:
                 only with ``ends_early``.
         """
         return roulette.survival(state, vertex, path, active)
+
+
+class EndingProgram(PathProgram):
+    """A program that may end paths before ``rr_depth``. This one does not: paths survive up to that
+    depth, and from there on with the probability of the walk's decision."""
+
+    ends_early = True
+
+    def survival(self, roulette, state, vertex, path, late, active):
+        survival, state = super().survival(roulette, state, vertex, path, late, active & late)
+        return dr.select(late, survival, 1), state

@@ -38,8 +38,8 @@ class PathState:
         arrival: How the path came to the vertex.
         hero_is_alone: Whether only the first of the four wavelengths is left; ``None`` where
             nothing in the scene disperses light.
-        sums: What MIS weights need about other techniques that can sample this path; ``None`` where
-            the densities at the last vertex suffice.
+        history: What the program of the walk knows of the path so far
+            (:class:`.path_program.PathProgram`); ``None`` if it needs nothing.
     """
 
     β: mi.Spectrum
@@ -48,7 +48,7 @@ class PathState:
     depth: mi.UInt32
     arrival: Arrival
     hero_is_alone: mi.Bool | None
-    sums: Any = None
+    history: Any = None
 
 
 @dataclass

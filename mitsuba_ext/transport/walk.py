@@ -33,9 +33,9 @@ from .path_decisions import (
     Scattering,
     SceneQuery,
     ShadowTest,
-    Subpaths,
     Weights,
 )
+from .path_program import PathProgram
 from .replay import Replay
 from .vertex import Arrival, PathState, Vertex
 
@@ -57,7 +57,8 @@ class Walk:
         query: How rays intersect the scene.
         distance: Which random numbers choose how far a path flies in a medium.
         mis: The MIS weights of connections and of scattering.
-        subpaths: Other subpaths whose vertices are connected to those of the path.
+        program: Follows the paths for the estimator that they belong to: knows their history, which
+            decides on weights, on where they end, and on the light of other subpaths.
         observer: Receives the events of the walk.
         replay: Propagates derivatives along the paths; ``None`` if they are traced for the first
             time.
@@ -75,7 +76,7 @@ class Walk:
     query: SceneQuery = field(default_factory=SceneQuery)
     distance: Distances = field(default_factory=Distances)
     mis: Weights = field(default_factory=Weights)
-    subpaths: Subpaths | None = None
+    program: PathProgram = field(default_factory=PathProgram)
     observer: Observer = field(default_factory=Observer)
     replay: Replay | None = None
 
@@ -102,11 +103,12 @@ class Walk:
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.mis, self.observer, media, self.replay,
+            self.query, heroes, self.mis, self.program, self.observer, media, self.replay,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
         # In media, transmittance takes random numbers, which `volpath` draws before the BSDF's
         makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
+        has_subpaths = self.program.subpaths is not None
 
         # --------------------- Configure the loop state ----------------------
         pixel = rays.pixel
@@ -119,7 +121,7 @@ class Walk:
             depth=mi.UInt32(0),
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
-            sums=self.mis.begin(ray),
+            history=self.program.begin(ray),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -139,17 +141,17 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
-            if dr.hint(media.exist and self.subpaths is not None, mode="scalar"):
-                L += self.subpaths.along(sampler, ray, si, inside, path, active)
+            if dr.hint(media.exist and has_subpaths, mode="scalar"):
+                L += self.program.subpaths.along(sampler, ray, si, inside, path, active)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
-            path.sums = self.mis.arrive(path, si)
+            path.history = self.program.arrive(path, si)
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, mis, hit, light_pdf = emission(
                     scene, self.query, si, path, self.next_event, next_event_state, self.mis,
-                    count,
+                    self.program, count,
                 )
                 emitted = media.visible_emission(emitted, path, si, valid)
                 L = dr.fma(path.β, emitted, L)
@@ -187,8 +189,10 @@ class Walk:
                 connector, makes_one, makes_early, place, sampler, vertex, active_em
             )
             wo = si.to_local(connection.ds.d)
-            if dr.hint(self.subpaths is not None, mode="scalar"):
-                gathered, shadow_rays = self.subpaths.gather(scene, sampler, vertex, active_em)
+            if dr.hint(has_subpaths, mode="scalar"):
+                gathered, shadow_rays = self.program.subpaths.gather(
+                    scene, sampler, vertex, active_em
+                )
                 L += gathered
                 shadow_count += shadow_rays
 
@@ -224,10 +228,10 @@ class Walk:
             ray = self.query.starts.along(si, si.to_world(bs.wo))
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            β, sums = path.β * (bsdf_weight * directions_weight), self.mis.leave(vertex, bs)
-            if dr.hint(self.subpaths is not None, mode="scalar"):
-                stored, sums = self.subpaths.beyond(vertex, bs, β, sums, active_next)
-                L += stored
+            β, history = path.β * (bsdf_weight * directions_weight), self.program.leave(vertex, bs)
+            known, history = self.program.known(vertex, bs, β, history, active_next)
+            if dr.hint(known is not None, mode="scalar"):
+                L += known
             onward = PathState(
                 β=β,
                 η=path.η * bs.eta,
@@ -235,7 +239,7 @@ class Walk:
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
-                sums=sums,
+                history=history,
             )
             path = media.leave(vertex, bs, onward)
             active_next = media.is_within(path.depth, self.max_depth, active_next)
@@ -244,10 +248,11 @@ class Walk:
             inside = media.cross(inside, si, ray.d)
 
             # ----- Russian roulette -----
-            rr_active = path.depth >= self.rr_depth
+            late = path.depth >= self.rr_depth
+            rr_active = late | self.program.ends_early
             carries = dr.max(path.β) != 0  # False for NaN
-            survival, roulette_state = self.roulette.survival(
-                roulette_state, vertex, path, active_next & rr_active & carries
+            survival, roulette_state = self.program.survival(
+                self.roulette, roulette_state, vertex, path, late, active_next & rr_active & carries
             )
             rr_continue = sampler.next_1d() < survival
             self.observer.survival(

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_ext.estimators.light_paths.bidirectional_program import BidirectionalProgram
 from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
 from mitsuba_ext.estimators.light_paths.light_sums import LightSums
@@ -18,9 +19,13 @@ from mitsuba_ext.estimators.light_paths.scattering import (
     reverse_density,
 )
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
-from mitsuba_ext.estimators.light_paths.weights import BidirectionalWeights
 from mitsuba_ext.transport.emission import emission
-from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery, SubpathSelection
+from mitsuba_ext.transport.path_decisions import (
+    EmitterSampling,
+    SceneQuery,
+    SubpathSelection,
+    Weights,
+)
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 
 
@@ -164,7 +169,7 @@ def weights_of_techniques(
         CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS
     )
     active = paths.active
-    weights = BidirectionalWeights(scene, sums, emits, sensor)
+    program, weights = BidirectionalProgram(scene, sums, emits, sensor), Weights()
     ctx = mi.BSDFContext()
     vertices, emitted = paths.vertices, paths.emitted
 
@@ -200,13 +205,13 @@ def weights_of_techniques(
     path = PathState(
         mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0),
         Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), None,
-        weights.begin(paths.camera_ray),
+        program.begin(paths.camera_ray),
     )  # fmt: skip
     by_camera: list[Vertex] = []
     state = next_event.begin(None, paths.camera_ray)
     for v in reversed(vertices):
         si = v.from_camera
-        path.sums = weights.arrive(path, si)
+        path.history = program.arrive(path, si)
         vertex = Vertex(si, v.bsdf, path)
         by_camera.insert(0, vertex)
         bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
@@ -219,7 +224,7 @@ def weights_of_techniques(
         state = next_event.remember(place, scene, si.to_world(bs.wo), mi.Float(0), active)
         path = PathState(
             mi.Spectrum(1), mi.Float(1), mi.Float(1), path.depth + 1,
-            Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), None, weights.leave(vertex, bs),
+            Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), None, program.leave(vertex, bs),
         )  # fmt: skip
 
     # ----- s = 0, 1 -----
@@ -239,11 +244,11 @@ def weights_of_techniques(
     class Record:
         def emission(self, *arguments):
             hits["pdf"] = arguments[-1]
-            hits["weight"] = weights.emission(*arguments)
+            hits["weight"] = program.emission(*arguments)
             return hits["weight"]
 
-    path.sums = weights.arrive(path, si)
-    emission(scene, SceneQuery(), si, path, next_event, state, Record())
+    path.history = program.arrive(path, si)
+    emission(scene, SceneQuery(), si, path, next_event, state, weights, Record())
     found.append(dr.select(is_hit, hits["weight"], 0))
 
     probability = next_event.probability(
@@ -256,7 +261,7 @@ def weights_of_techniques(
     ds.delta = is_delta_light
     ds.pdf = dr.select(is_hit, hits["pdf"], probability)
     by_scattering = first.bsdf.pdf(ctx, first.from_camera, first.from_light.wi, active)
-    connected = weights.connection(scene, by_camera[0], ds, ds.pdf, by_scattering)
+    connected = program.connection(weights, scene, by_camera[0], ds, ds.pdf, by_scattering)
     found.append(dr.select(first.is_delta, 0, connected))
 
     # ----- s, t ≥ 2 -----
@@ -266,14 +271,14 @@ def weights_of_techniques(
             End(si, wo, v.bsdf.pdf(ctx, si, wo, active),
                 reverse_density(ctx, v.bsdf, si, wo, active), partial)
             for v, si, wo, partial in (
-                (b, b.from_camera, b.from_light.wi, by_camera[i + 1].path.sums),
+                (b, b.from_camera, b.from_light.wi, by_camera[i + 1].path.history),
                 (a, a.from_light, a.from_camera.wi, by_light[i]),
             )
         ]  # fmt: skip
         expected = 1.0
         if selection is not None:
             expected = selection.expected(
-                by_camera[i + 1].path.sums.region, by_light[i].region, active
+                by_camera[i + 1].path.history.region, by_light[i].region, active
             )
         joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p), expected)
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))

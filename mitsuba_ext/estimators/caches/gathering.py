@@ -74,13 +74,13 @@ class Gatherer:
         numbers = (dr.opaque(mi.UInt32, number) for number in (M, N))
         vectors = (places.p, places.geometric, frames[:, 0], frames[:, 1], frames[:, 2])
         columns = [from_numpy(mi.Float, vector) for vector in vectors]
-        weights, lane = IndirectOnly(lanes), dr.arange(mi.UInt32, lanes)
+        program, lane = IndirectOnly(lanes), dr.arange(mi.UInt32, lanes)
         dr.eval(lane)
-        walk = replace(self._walk, mis=weights)
+        walk = replace(self._walk, program=program)
         L = _traced(walk, self._scene, sampler, lane, *numbers, columns)
-        dr.eval(L, weights.distance)
+        dr.eval(L, program.distance)
         radiance = np.array(L).reshape(-1, count, N, M).transpose(1, 2, 3, 0)
-        return radiance, np.array(weights.distance).reshape(count, N, M)
+        return radiance, np.array(program.distance).reshape(count, N, M)
 
 
 @frozen(any_width=True)

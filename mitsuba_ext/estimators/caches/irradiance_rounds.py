@@ -21,7 +21,7 @@ from ...transport.path_decisions import NoConnections
 from ...transport.walk import Walk
 from ...util.arrays import from_numpy
 from ..light_paths.merging.merging import scene_diagonal
-from .cached_light import CameraPhases, EndsAtTheCache, FindsPlaces
+from .cached_light import FindsPlaces
 from .choice import chosen
 from .gathering import Gatherer
 from .record_grid import RecordGrid
@@ -109,9 +109,8 @@ class CacheRounds:
         self.rounds: list[Round] = []
         self._grid = RecordGrid(records, parameters.accuracy)
         self._walk = Walk(
-            walk.max_depth, 0, walk.hide_emitters, query=walk.query,
-            next_event=NoConnections(), roulette=EndsAtTheCache(walk.rr_depth),
-            mis=CameraPhases(),
+            walk.max_depth, walk.rr_depth, walk.hide_emitters, query=walk.query,
+            next_event=NoConnections(),
         )  # fmt: skip
         self._apart, self._angle = pixel_cone(scene, sensor)
 
@@ -163,7 +162,7 @@ class CacheRounds:
         seed = mi.sample_tea_32(mi.UInt32(self._seed), mi.UInt32(len(self.rounds) + 0x20000))[0]
         sampler.seed(dr.opaque(mi.UInt32, seed[0]), lanes.count)
         finds = FindsPlaces(self._grid, self._walk.max_depth, lanes.count)
-        walk = replace(self._walk, subpaths=finds)
+        walk = replace(self._walk, program=finds)
         dr.eval(look(walk, CameraSamples(), self._scene, self._sensor, sampler, lanes, 1))
         asks, covered = finds.asks.numpy(), finds.covered.numpy()
         arrays = (np.array(v).T for v in (finds.p, finds.n, finds.geometric))

@@ -10,7 +10,8 @@ import mitsuba as mi
 from ...transport.bsdfs import bsdf_density, eval_bsdf
 from ...transport.heroes import Heroes
 from ...transport.observer import Observer
-from ...transport.path_decisions import SceneQuery, Subpaths
+from ...transport.path_decisions import SceneQuery
+from ...transport.path_program import Subpaths
 from ...transport.vertex import Vertex
 from .choice.technique_observer import TechniqueObserver
 from .light_vertices import VertexCache
@@ -169,7 +170,7 @@ class LightSubpaths(Subpaths):
         # ----- MIS weight -----
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         far_pdf = bsdf_density(far_bsdf, self._ctx, far, back, active)
-        near_end = End(si, wo, pdf, reverse, vertex.path.sums)
+        near_end = End(si, wo, pdf, reverse, vertex.path.history)
         far_end = End(far, back, far_pdf, far_reverse, other.history)
         mis = joining_weight(
             self._sums, near_end, far_end, squared_distance, chosen.expected

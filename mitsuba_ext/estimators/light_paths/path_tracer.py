@@ -15,8 +15,10 @@ from ...transport.heroes import Heroes
 from ...transport.numbers import BothEnds, Numbers, copied, go_to, reached
 from ...transport.observer import Observers
 from ...transport.path_decisions import SubpathSelection
+from ...transport.path_program import PathProgram
 from ...transport.walk import Walk
 from ...transport.without_lengths import WithoutLengths
+from .bidirectional_program import BidirectionalProgram
 from .choice.candidates import Available
 from .choice.technique_observer import TechniqueObserver
 from .connections import LightSubpaths
@@ -32,7 +34,6 @@ from .merging.vertex_grid import VertexGrid
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
-from .weights import BidirectionalWeights
 
 #: The number of vertices of a light path that MIS weights assume. The true number would make the
 #: weights depend on the samples. (door_ajar: 11 % less variance than with 1.)
@@ -122,10 +123,10 @@ class BidirectionalPathTracer:
                 scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
                 2 if self.skips_direct else 1, observer, per_camera_path,
             )  # fmt: skip
-        program = LightSums(sums, walk.next_event)
         light_walk = LightWalk(
-            self.emission, walk.max_depth, walk.rr_depth, program, query=walk.query
-        )
+            self.emission, walk.max_depth, walk.rr_depth, LightSums(sums, walk.next_event),
+            query=walk.query,
+        )  # fmt: skip
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
         rounds: list[LightVertices] = []
@@ -139,9 +140,6 @@ class BidirectionalPathTracer:
             scene, light.numbers, light.time, light.wavelengths, light.emits(active), take
         )
         splats = image.splats() if image is not None else []
-        weights = BidirectionalWeights(scene, sums, self.emission, self.sensor, observer)
-        if self.skips_direct:
-            weights = WithoutLengths(weights, 1, 2)
         subpaths = None
         if rounds:
             vertices = VertexCache(rounds, light.count)
@@ -161,11 +159,14 @@ class BidirectionalPathTracer:
                     vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
                     observer,
                 )  # fmt: skip
+        program: PathProgram = BidirectionalProgram(
+            scene, sums, self.emission, self.sensor, observer, subpaths
+        )
+        if self.skips_direct:
+            program = WithoutLengths(program, 1, 2)
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
-        sample = camera_paths(
-            replace(walk, mis=weights, subpaths=subpaths), scene, sampler, rays, active
-        )
+        sample = camera_paths(replace(walk, program=program), scene, sampler, rays, active)
         # The first lane counts all rays that are not those of the path in a lane
         is_first = dr.arange(mi.UInt32, lanes) == 0
         shadow_count = sample.shadow_count

@@ -96,7 +96,7 @@ class RegionChoice(VertexChoice):
         return sampler.next_2d(), sampler.next_2d()
 
     def choose(self, numbers, vertex, active):
-        mine = vertex.path.sums.region
+        mine = vertex.path.history.region
         region, probability = self._selection.choose(numbers[0], mine, active)
         first, number = dr.gather(mi.Vector2u, self._range, region, active)
         place = first + below(number, numbers[1])

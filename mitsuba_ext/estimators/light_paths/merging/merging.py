@@ -18,7 +18,8 @@ import numpy as np
 from ....scene.bounds import scene_bounds
 from ....transport.bsdfs import eval_bsdf
 from ....transport.heroes import Heroes
-from ....transport.path_decisions import SceneQuery, Subpaths
+from ....transport.path_decisions import SceneQuery
+from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
 from ..choice.technique_observer import TechniqueObserver
 from ..light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache, group_of
@@ -282,7 +283,7 @@ class MergedSubpaths(Subpaths):
         mis, rivals = mi.Float(1), None
         if self._sums is not None:
             reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-            ends = other.history, pdf, vertex.path.sums, reverse
+            ends = other.history, pdf, vertex.path.history, reverse
             mis = self._sums.merging_weight(*ends)
             value *= mis
             if self._sums.splits:

@@ -23,7 +23,7 @@ import mitsuba as mi
 from ....transport.free_flight import Distances, attenuation, component, extinction, interaction_at
 from ....transport.heroes import Heroes
 from ....transport.media import eval_phase
-from ....transport.path_decisions import Subpaths
+from ....transport.path_program import Subpaths
 from ....transport.vertex import PathState, Vertex
 from ..choice.technique_observer import TechniqueObserver
 from ..light_vertices import LightVertex, VertexCache, group_of

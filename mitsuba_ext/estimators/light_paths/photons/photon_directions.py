@@ -16,8 +16,8 @@ from ....transport.bsdfs import eval_and_sample_bsdf, eval_bsdf
 from ....transport.path_decisions import Scattering
 from ....transport.vertex import Vertex
 from ..light_vertices import LightVertex
+from .gathering_paths import BEFORE, is_diffuse
 from .photon_maps import PhotonMaps
-from .photon_phases import BEFORE, is_diffuse
 
 #: Concentration of the lobe around the direction of a photon (von Mises and Fisher's κ: half of the
 #: lobe lies within 15 degrees); and the share of directions that follow photons.
@@ -76,7 +76,7 @@ class PhotonDirections(Scattering):
 
     def _guides(self, vertex: Vertex) -> mi.Bool:
         """Where does a final gather begin?"""
-        return vertex.si.is_valid() & (vertex.path.sums == BEFORE) & is_diffuse(vertex.bsdf)
+        return vertex.si.is_valid() & (vertex.path.history == BEFORE) & is_diffuse(vertex.bsdf)
 
     @dr.syntax
     def _chosen(

@@ -17,7 +17,7 @@ from ....scene.movers import movers
 from ....transport.estimator import CameraRays, Sample
 from ....transport.heroes import Heroes
 from ....transport.numbers import Numbers
-from ....transport.path_decisions import Roulette, Weights
+from ....transport.path_program import EndingProgram, Subpaths
 from ....transport.walk import Walk
 from ..choice.technique_observer import TechniqueObserver
 from ..light_numbers import LightPathRays
@@ -41,18 +41,22 @@ def most_lanes(light_paths: float) -> int:
     return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
 
 
-class OnlySpecular(Roulette):
-    """Ends a path where it was scattered by a lobe that is not a delta distribution."""
+class SpecularPaths(EndingProgram):
+    """Ends a path where it was scattered by a lobe that is not a delta distribution. Nothing else
+    finds the lights that it hits by way of mirrors and clear glass.
 
-    def survival(self, state, vertex, path, active):
-        return dr.select(path.arrival.is_delta, mi.Float(1), 0), state
+    Parameters:
+        subpaths: The photons; ``None`` if there are none.
+    """
 
+    def __init__(self, subpaths: Subpaths | None) -> None:
+        self.subpaths = subpaths
 
-class FoundByCamera(Weights):
-    """Nothing else finds the lights that a camera path hits by way of mirrors and clear glass."""
-
-    def emission(self, scene, si, ds, path, pdf):
+    def emission(self, weights, scene, si, ds, path, pdf):
         return mi.Float(1)
+
+    def survival(self, roulette, state, vertex, path, late, active):
+        return dr.select(path.arrival.is_delta, mi.Float(1), 0), state
 
 
 @dataclass
@@ -103,12 +107,12 @@ class PhotonMapper:
             scene, light.numbers, light.time, light.wavelengths, light.emits(active),
             lambda vertices: rounds.append(PackedVertices(vertices)),
         )  # fmt: skip
-        walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
+        walk, merged = self.walk, None
         if rounds:
             if self.ball is not None:
-                walk.distance = PassesThrough()
-            vertices = VertexCache(rounds, light.count)
-            walk = replace(walk, subpaths=self._merged(scene, vertices, light.count))
+                walk = replace(walk, distance=PassesThrough())
+            merged = self._merged(scene, VertexCache(rounds, light.count), light.count)
+        walk = replace(walk, program=SpecularPaths(merged))
         sample = walk(scene, sampler, rays, active)
         scatter_count = light.by_camera_path(scatter_count, lanes)
         whole = replace(sample, scatter_count=sample.scatter_count + scatter_count)

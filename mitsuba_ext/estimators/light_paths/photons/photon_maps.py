@@ -20,13 +20,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ....transport.heroes import Heroes
-from ....transport.path_decisions import Subpaths
+from ....transport.path_program import Subpaths
 from ..light_vertices import LightVertices, PackedVertices, VertexCache
 from ..light_walk import LightWalk
 from ..merging.merging import MergedSubpaths, disk_radius, scene_diagonal
 from ..merging.vertex_grid import VertexGrid
+from .gathering_paths import BEFORE, is_diffuse
 from .photon_history import PhotonProgram
-from .photon_phases import BEFORE, is_diffuse
 
 #: The radii of a map: how many, and the ratio of one to the one before. Where the search for a
 #: suitable one begins, at most, and the largest one, in units of the diagonal of the scene.
@@ -183,7 +183,7 @@ class PhotonSubpaths(Subpaths):
 
     def gather(self, scene, sampler, vertex, active):
         active = active & is_diffuse(vertex.bsdf)
-        is_first = vertex.path.sums == BEFORE
+        is_first = vertex.path.history == BEFORE
         total, rays = mi.Spectrum(0), mi.UInt32(0)
         if self._caustics is not None:
             total += self._caustics.gather(scene, sampler, vertex, active & is_first)[0]

@@ -66,7 +66,7 @@ class PairRecords(Observer):
         active = active & (vertex.depth < _VERTICES)
         slot = vertex.depth * self._stride + self._path
         # Of several connections of a vertex, the last one is kept
-        pair = vertex.path.sums.region * self._size + region
+        pair = vertex.path.history.region * self._size + region
         dr.scatter(self._pair, pair, slot, active)
         dr.scatter(self._value, brightness(value), slot, active)
 

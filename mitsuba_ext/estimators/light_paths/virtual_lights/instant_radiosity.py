@@ -16,7 +16,7 @@ from ....transport.walk import Walk
 from ..light_walk import LightWalk
 from ..path_tracer import camera_paths
 from ..photons.photon_history import RegionProgram
-from .virtual_light_bound import Bound, Compensation, EndsWithItsShare
+from .virtual_light_bound import Bound, CompensatingPaths
 from .virtual_light_choice import LearnedChoice, UniformChoice, VirtualLightChoice
 from .virtual_light_connections import VirtualLightConnections
 from .virtual_light_parts import LightParts, PictureOfLights
@@ -78,10 +78,7 @@ class InstantRadiosity:
             scene, light_walk, sampler, rays, set_count, self.sets.paths
         )
         self.tally.sets += set_count
-        walk = replace(
-            self.walk, mis=Compensation(self.bound, selection),
-            roulette=EndsWithItsShare(self.walk.rr_depth), rr_depth=0,
-        )  # fmt: skip
+        walk, subpaths = self.walk, None
         parts = LightParts(self.bound) if self.picture is not None else None
         if parts is not None:
             walk = replace(walk, observer=Observers([walk.observer, parts]))
@@ -95,7 +92,7 @@ class InstantRadiosity:
                 scene, lights.vertices, choice, self.bound, walk.query, self.connections,
                 walk.max_depth, walk.observer, parts,
             )  # fmt: skip
-            walk = replace(walk, subpaths=subpaths)
+        walk = replace(walk, program=CompensatingPaths(self.bound, selection, subpaths))
         sample = camera_paths(walk, scene, sampler, rays, active)
         if parts is not None:
             # The sums of the parts are complete when the kernel of the samples has run

@@ -24,11 +24,10 @@ import mitsuba as mi
 
 from ....transport.path_decisions import (
     LARGEST_PROBABILITY,
-    Roulette,
     SubpathSelection,
-    Weights,
     unguided_throughput,
 )
+from ....transport.path_program import EndingProgram, Subpaths
 from ..both_ends import from_both_ends
 
 
@@ -100,24 +99,31 @@ class Bound:
         return dr.select(kernel > self.largest, self.largest / kernel, 1)
 
 
-class Compensation(Weights):
-    """The weights of a camera path that is connected to virtual lights.
+class CompensatingPaths(EndingProgram):
+    """Camera paths that are connected to virtual lights. They find what the bound cuts off from
+    virtual lights; in Russian roulette, the share of the path counts like its throughput, at each
+    depth.
 
     Parameters:
         bound: The weights of both sides.
         selection: Chooses the regions of virtual lights, if they are chosen by regions.
+        subpaths: The virtual lights; ``None`` if there are none.
     """
 
-    def __init__(self, bound: Bound, selection: SubpathSelection | None = None) -> None:
-        super().__init__()
-        self.bound, self._selection = bound, selection
+    def __init__(
+        self,
+        bound: Bound,
+        selection: SubpathSelection | None = None,
+        subpaths: Subpaths | None = None,
+    ) -> None:
+        self.bound, self._selection, self.subpaths = bound, selection, subpaths
 
     def begin(self, ray):
         region = None if self._selection is None else mi.UInt32(0)
         return Link(mi.Float(1), mi.Float(dr.inf), mi.Float(dr.inf), mi.Bool(False), region)
 
     def arrive(self, path, si):
-        link, arrival = path.sums, path.arrival
+        link, arrival = path.history, path.arrival
         d = si.p - arrival.ref.p
         squared = dr.squared_norm(d)
         # Positive wherever the result is used: a ray has found the surface
@@ -137,37 +143,24 @@ class Compensation(Weights):
             link.connects, region,
         )  # fmt: skip
 
-    def emission(self, scene, si, ds, path, pdf):
+    def emission(self, weights, scene, si, ds, path, pdf):
         # Light from a lamp to the last vertex is no virtual light's
-        return super().emission(scene, si, ds, path, pdf) * path.sums.share
+        return super().emission(weights, scene, si, ds, path, pdf) * path.history.share
 
-    def connection(self, scene, vertex, ds, pdf, scattering_pdf):
-        weight = super().connection(scene, vertex, ds, pdf, scattering_pdf)
-        return weight * self.bound.share(vertex.path.sums, vertex.bsdf, scattering_pdf)
+    def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf):
+        weight = super().connection(weights, scene, vertex, ds, pdf, scattering_pdf)
+        return weight * self.bound.share(vertex.path.history, vertex.bsdf, scattering_pdf)
 
     def leave(self, vertex, bs):
-        link = vertex.path.sums
+        link = vertex.path.history
         scatters = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         # A virtual light does not shine into a delta lobe
         share = dr.select(scatters, self.bound.share(link, vertex.bsdf, bs.pdf), link.share)
         connects = scatters & is_connected(vertex.bsdf)
         return Link(share, link.kernel, link.plain, connects, link.region)
 
-
-class EndsWithItsShare(Roulette):
-    """Russian roulette by throughput, as in ``path``, in which the share of the path counts like
-    its throughput, at each depth.
-
-    Parameters:
-        rr_depth: See :class:`~mitsuba_ext.transport.walk.Walk`, whose own is 0.
-    """
-
-    def __init__(self, rr_depth: int) -> None:
-        self._rr_depth = dr.opaque(mi.UInt32, rr_depth)
-
-    def survival(self, state, vertex, path, active):
-        before, after = vertex.path.sums.share, path.sums.share
+    def survival(self, roulette, state, vertex, path, late, active):
+        before, after = vertex.path.history.share, path.history.share
         change = dr.select(before > 0, after / before, 0)
         by_throughput = dr.minimum(unguided_throughput(path) * after, LARGEST_PROBABILITY)
-        late = path.depth >= self._rr_depth
         return dr.select(late, dr.minimum(by_throughput, change), change), state

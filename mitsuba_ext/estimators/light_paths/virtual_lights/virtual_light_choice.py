@@ -118,7 +118,7 @@ class LearnedChoice:
         return sampler.next_2d(), sampler.next_2d()
 
     def choose(self, numbers, vertex, active):
-        mine = vertex.path.sums.region
+        mine = vertex.path.history.region
         region, probability = self._selection.choose(numbers[0], mine, active)
         first, number = dr.gather(mi.Vector2u, self._ranges, region, active)
         exists = active & (number > 0) & (probability > 0)

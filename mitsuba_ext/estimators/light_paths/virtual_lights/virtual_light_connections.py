@@ -8,7 +8,8 @@ import mitsuba as mi
 from ....transport.bsdfs import eval_bsdf
 from ....transport.heroes import Heroes
 from ....transport.observer import Observer
-from ....transport.path_decisions import SceneQuery, Subpaths
+from ....transport.path_decisions import SceneQuery
+from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
 from ..light_vertices import VertexCache
 from ..scattering import adjoint_value, geometric_cosine
@@ -56,7 +57,7 @@ class VirtualLightConnections(Subpaths):
     def gather(self, scene, sampler, vertex, active):
         total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
         # A path without a share ends here
-        active = active & is_connected(vertex.bsdf) & (vertex.path.sums.share > 0)
+        active = active & is_connected(vertex.bsdf) & (vertex.path.history.share > 0)
         active &= vertex.depth + 3 <= self._max_depth
         if dr.hint(self._connections == 1, mode="scalar"):
             total, shadow_count = self._connect(
@@ -110,7 +111,7 @@ class VirtualLightConnections(Subpaths):
         value *= chosen.factor * self._share * inverse
 
         # ----- The weight of this segment, and of those before -----
-        link = vertex.path.sums
+        link = vertex.path.history
         kernel = dr.pi * pdf * geometric_cosine(far, back) * inverse
         value *= self._bound.connected(kernel, far_pdf)
         value *= self._bound.share(link, vertex.bsdf, pdf)

@@ -43,10 +43,10 @@ class LightParts(Observer):
         self._sums = dr.zeros(mi.Spectrum, len(PARTS) * self._lanes)
 
     def emission(self, path, ds, value, mis, pdf, active):
-        self._add_found(path.sums.share, value, active)
+        self._add_found(path.history.share, value, active)
 
     def connection(self, choice, vertex, ds, contribution, value, pdf, visible, tested):
-        share = self._bound.share(vertex.path.sums, vertex.bsdf, pdf)
+        share = self._bound.share(vertex.path.history, vertex.bsdf, pdf)
         self._add_found(share, value, visible)
 
     def virtual(self, value: mi.Spectrum, active: mi.Bool) -> None:

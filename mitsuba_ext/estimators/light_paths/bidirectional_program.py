@@ -1,4 +1,4 @@
-"""MIS weights of the techniques of camera paths (s = 0 and 1), in combination with light paths."""
+"""The camera paths of bidirectional path tracing."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.heroes import Heroes
-from ...transport.path_decisions import Weights
+from ...transport.path_program import PathProgram, Subpaths
 from ...transport.vertex import PathState, Vertex
 from .choice.technique_observer import TechniqueObserver
 from .emission import LightEmission
@@ -15,10 +15,10 @@ from .scattering import cosine_of_delta, geometric_cosine, reverse_density
 from .sensor import ConnectableSensor
 
 
-class BidirectionalWeights(Weights):
-    """MIS weights over all bidirectional techniques: s vertices come from a light path (0: a camera
-    path hits the light; 1: next event estimation), and t from a camera path (1: a light path's
-    vertex is connected to the sensor).
+class BidirectionalProgram(PathProgram):
+    """Weighs camera paths over all bidirectional techniques: s vertices come from a light path (0:
+    a camera path hits the light; 1: next event estimation), and t from a camera path (1: a light
+    path's vertex is connected to the sensor). The history is the partial sums.
 
     Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012.
 
@@ -28,6 +28,7 @@ class BidirectionalWeights(Weights):
         emission: Gives the densities of the rays with which light paths begin.
         sensor: The sensor to which light paths are connected; ``None`` to leave out t = 1.
         observer: Is told the rivals of techniques; ``None`` if nobody asks.
+        subpaths: Connects camera paths to light paths, and merges them.
     """
 
     def __init__(
@@ -37,15 +38,17 @@ class BidirectionalWeights(Weights):
         emission: LightEmission,
         sensor: ConnectableSensor | None,
         observer: TechniqueObserver | None = None,
+        subpaths: Subpaths | None = None,
     ) -> None:
         self._ctx = Heroes(scene).context()
         self.sums, self._emission, self._sensor = sums, emission, sensor
         self._observer = observer if sums.splits else None
         self._origin = mi.Point3f(0)
+        self.subpaths = subpaths
 
     def kernel_state(self) -> tuple:
         """The objects that kernels depend on."""
-        return self.sums, self._emission, self._sensor
+        return self.sums, self._emission, self._sensor, self.subpaths
 
     def begin(self, ray: mi.Ray3f) -> Sums:
         if self._sensor is None:
@@ -58,18 +61,18 @@ class BidirectionalWeights(Weights):
         is_first = path.depth == 0
         ref = dr.select(is_first, self._origin, path.arrival.ref.p)
         later = self.sums.arrive(
-            path.sums, si, dr.squared_norm(si.p - ref), is_first, by_light=False
+            path.history, si, dr.squared_norm(si.p - ref), is_first, by_light=False
         )
         # A ray that hits nothing keeps its density per solid angle
         return Sums(
-            dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
-            dr.select(si.is_valid(), later.dVC, path.sums.dVC),
+            dr.select(si.is_valid(), later.dVCM, path.history.dVCM),
+            dr.select(si.is_valid(), later.dVC, path.history.dVC),
             region=later.region,
             count=later.count,
             by_kind=later.by_kind,
         )
 
-    def emission(self, scene, si, ds, path, pdf) -> mi.Float:
+    def emission(self, weights, scene, si, ds, path, pdf) -> mi.Float:
         active = ds.emitter != None  # noqa: E711
         position, direction = self._emission.densities(
             scene, ds.emitter, -ds.d, self._emission.front(si), path.arrival.ref, active
@@ -79,15 +82,15 @@ class BidirectionalWeights(Weights):
             si.is_valid(), dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist), 1
         )
         # dVCM holds the count of connections to light paths, but there is one to a light
-        others = self.sums.ratio(found) * path.sums.dVCM / self.sums.count
+        others = self.sums.ratio(found) * path.history.dVCM / self.sums.count
         emitted = self.sums.ratio(position * direction)
-        others += emitted * path.sums.dVC
+        others += emitted * path.history.dVC
         if self._observer is not None:
-            self._observer.weighed(emitted * path.sums.by_kind)
+            self._observer.weighed(emitted * path.history.by_kind)
         # No other technique finds lights that the sensor sees directly
         return dr.select(path.depth == 0, 1, weight(others))
 
-    def connection(self, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
+    def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
         si, active = vertex.si, pdf > 0
         wo = si.to_local(ds.d)
         position, direction = self._emission.densities(
@@ -102,7 +105,7 @@ class BidirectionalWeights(Weights):
         emitted *= dr.select(is_point, dr.rcp(dr.square(ds.dist)), 1)
         emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)
         inverse = dr.select(active, dr.rcp(pdf), 0)
-        sums = vertex.path.sums
+        sums = vertex.path.history
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         others = self.sums.others(emitted * inverse, sums, reverse)
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
@@ -122,17 +125,17 @@ class BidirectionalWeights(Weights):
         cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
         cosine = dr.select(self.sums.is_open(si, bs.wo), cosine, 0)
         sums = self.sums.leave(
-            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0, by_light=False
+            vertex.path.history, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0,
+            by_light=False,
         )
         if self.sums.merging is not None:
             ref = vertex.path.arrival.ref
             d = si.p - ref.p
             squared = dr.squared_norm(d)
             before = self.sums.merging_before(
-                vertex.path.sums, squared, dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared)
+                vertex.path.history, squared, dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared)
             )
             # The vertex before the first one is the sensor
             merges = si.is_valid() & is_delta & (vertex.depth > 0) & (squared > 0)
             sums.dVC += dr.select(merges, self.sums.ratio(cosine) * before, 0)
         return sums
-
