@@ -12,8 +12,8 @@ from ...scene.bounds import scene_bounds
 from ...scene.bsdfs import bsdf_table, has_clear_curves
 from ...transport.numbers import Numbers
 from ...transport.ray_starts import ray_starts
-from ...util.arrays import from_numpy
 from . import light_pieces as pieces
+from .emitter_table import EmitterRow, EmitterTable
 from .light_directions import NOT_RECIPROCAL
 from .light_pieces import LightPieces, Piece
 from .stored_interaction import needs_whole_interaction
@@ -30,9 +30,6 @@ _OFFSET = 0.05
 #: The radius of the disks on which paths from lights at infinity begin, in units of the radius of
 #: the scene's bounding sphere.
 _MARGIN = 1.001
-
-#: Words of an emitter in the table of densities.
-_WORDS = 8
 
 
 @dataclass
@@ -134,22 +131,7 @@ class LightEmission:
         density = (self.probability > 0) / np.maximum(self._pieces.area, 1e-300)
         density[self._infinite] = 1 / (np.pi * (_MARGIN * sphere.radius) ** 2)
         density[self._delta_position] = 1
-        self._tabulate(density)
-
-    def _tabulate(self, density: np.ndarray) -> None:
-        """Makes the table, a row for each emitter: probability, density of the position, kind and
-        ``way``, parameter, axis."""
-        count = len(density)
-        table = np.zeros((count, _WORDS), dtype=np.float32)
-        table[:, 0], table[:, 1] = self.probability, density
-        mark = self._pieces.kind + 16 * self._pieces.way + 64 * self._delta_direction
-        table[:, 2], table[:, 3] = mark, self._pieces.parameter
-        table[:, 4:7] = self._pieces.axis
-        self._table = from_numpy(mi.Float, table)
-        ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
-        index = np.zeros(ids.max() + 1, dtype=np.uint32)
-        index[ids] = np.arange(count)
-        self._index = from_numpy(mi.UInt32, index)
+        self._table = EmitterTable(self._pieces, density, self._delta_direction, self._emitters)
 
     # ---- Sampling ----
 
@@ -170,7 +152,7 @@ class LightEmission:
         u, v = numbers.next_2d(), numbers.next_2d()
         index = piece.emitter
         emitter = dr.gather(mi.EmitterPtr, self._emitters, index, active)
-        row = self._row(index, active)
+        row = self._table.row(index, active)
         is_surface = active & (piece.kind <= pieces.CYLINDER)
         ray = dr.zeros(mi.Ray3f, dr.width(index))
         ray.time, ray.wavelengths = time, wavelengths
@@ -230,7 +212,7 @@ class LightEmission:
         pdf = self._weighing_density(local.z, piece.parameter)
         if self._has_beams:
             pdf = dr.select(is_beam, 1, pdf)
-            density = self._row(piece.emitter, active).density
+            density = self._table.row(piece.emitter, active).density
             for index, light in self._beams:
                 # A beam has no radiance to evaluate; the weight of ``sample_ray`` is radiance ·
                 # area. This is no call of an ``EmitterPtr``, since other lights may have textures
@@ -340,7 +322,7 @@ class LightEmission:
             ``probability · pdf_position`` and ``pdf_direction``, as in :class:`EmittedRay`.
         """
         index = self.index(emitter, active)
-        row = self._row(index, active)
+        row = self._table.row(index, active)
         pdf = mi.Float(1)
         if self._has_surfaces:
             leaves = self._cosine_density if knows_normal else self._weighing_density
@@ -373,13 +355,12 @@ class LightEmission:
         return dr.select(dr.dot(si.n, si.sh_frame.n) < 0, -si.n, si.n)
 
     def chance(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """The probability with which an emitter is chosen."""
-        return dr.gather(mi.Float, self._table, index * _WORDS, active)
+        """See :meth:`.EmitterTable.chance`."""
+        return self._table.chance(index, active)
 
     def index(self, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.UInt32:
-        """The number of an emitter in ``scene.emitters()``."""
-        id = dr.reinterpret_array(mi.UInt32, emitter)
-        return dr.gather(mi.UInt32, self._index, id, active & (id < len(self._index)))
+        """See :meth:`.EmitterTable.index`."""
+        return self._table.index(emitter, active)
 
     def _cosine_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
         """The density of a direction of emission that has this cosine with the normal."""
@@ -392,32 +373,9 @@ class LightEmission:
         is_smooth = self.has_smooth_meshes & (way == float(pieces.TO_BOTH_SIDES))
         return self._cosine_density(dr.select(is_smooth, dr.abs(cosine), cosine), way)
 
-    def _row(self, index: mi.UInt32, active: mi.Bool) -> _Row:
-        words = dr.gather(
-            mi.ArrayXf, self._table, index, active, shape=(_WORDS, dr.width(index))
-        )
-        mark = mi.UInt32(words[2])
-        return _Row(
-            words[0], words[1], mark & 15, mi.Float((mark >> 4) & 3), (mark & 64) != 0, words[3],
-            mi.Vector3f(words[4], words[5], words[6]),
-        )  # fmt: skip
-
-    def _flags(self, kind: mi.UInt32, row: _Row) -> tuple[mi.Bool, mi.Bool, mi.Bool]:
+    def _flags(self, kind: mi.UInt32, row: EmitterRow) -> tuple[mi.Bool, mi.Bool, mi.Bool]:
         is_point = (kind >= pieces.POINT) & (kind <= pieces.PROJECTOR)
         return is_point, row.is_beam, kind == pieces.INFINITE
-
-
-@dataclass
-class _Row:
-    """The row of an emitter in the table."""
-
-    probability: mi.Float
-    density: mi.Float
-    kind: mi.UInt32
-    way: mi.Float
-    is_beam: mi.Bool
-    parameter: mi.Float
-    axis: mi.Vector3f
 
 
 def _cone_density(cos_cutoff: mi.Float) -> mi.Float:

@@ -105,7 +105,7 @@ class LightPieces:
         entry = dr.arange(mi.UInt32, len(relative))
         first, last = mi.UInt32(0), mi.UInt32(len(relative) - 1)
         threshold, alias = alias_tables(
-            mi.Float64(relative), dr.zeros(mi.UInt32, len(relative)) + first,
+            from_numpy(mi.Float64, relative), dr.zeros(mi.UInt32, len(relative)) + first,
             dr.zeros(mi.UInt32, len(relative)) + last, len(relative),
         )  # fmt: skip
         self._alias = dr.zeros(mi.Float, 2 * len(relative))
