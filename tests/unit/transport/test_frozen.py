@@ -347,7 +347,7 @@ class _CopyingWalk(Walk):
 def test_walks_that_cannot_be_recorded_render_the_same_image(kind: type[Walk]) -> None:
     scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
     expected = 2 * _traced(scene, integrator)
-    integrator.walk = lambda **decisions: kind(3, 5, **decisions)
+    integrator.walk = lambda decisions, observer=None: kind(3, 5, **decisions.of_walk())
     for _ in range(2):
         _assert_same(_image(scene, integrator), expected)
 

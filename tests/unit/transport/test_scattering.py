@@ -3,13 +3,17 @@ a vertex and with many."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
+from mitsuba_ext.transport.decisions import Decisions
+from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.path_decisions import Scattering
+from mitsuba_ext.transport.walk import Walk
 from tests.support.statistical import (
     REFERENCE_SEEDS,
     SEEDS,
@@ -66,7 +70,11 @@ class UniformMixture(Scattering):
 def _mixing(max_depth: int, share: float, **slots: Any) -> mi.Integrator:
     integrator = mi.load_dict({"type": "composed_path", "max_depth": max_depth, **slots})
     make = integrator.walk
-    integrator.walk = lambda **decisions: make(scattering=UniformMixture(share), **decisions)
+
+    def walk(decisions: Decisions, observer: Observer | None = None) -> Walk:
+        return make(replace(decisions, scattering=UniformMixture(share)), observer)
+
+    integrator.walk = walk
     return integrator
 
 
