@@ -284,10 +284,10 @@ def weights_of_techniques(
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
         factor = 1 / (CONNECTIONS * expected)
         is_first = b is vertices[-1], i == 0
-        rivals = joining_rivals(
+        competing = joining_rivals(
             sums, *ends, dr.squared_norm(b.p - a.p), is_first, factor, expected
         )
-        ratios.append([*rivals.by_camera, *rivals.by_kind])
+        ratios.append([*competing.by_camera, *competing.by_kind])
 
     # ----- t = 1 -----
     if sensor is not None:

@@ -15,7 +15,7 @@ from ...transport.path_program import Subpaths
 from ...transport.vertex import Vertex
 from .choice.technique_observer import TechniqueObserver
 from .light_vertices import VertexCache
-from .partial_sums import PartialSums, Rivals, Sums, weight
+from .partial_sums import CompetingDensities, PartialSums, Sums, weight
 from .scattering import adjoint_value, geometric_cosine, reverse_density
 from .vertex_choice import VertexChoice
 
@@ -64,14 +64,15 @@ def joining_rivals(
     is_first: tuple[mi.Bool | bool, mi.Bool | bool],
     factor: mi.Float | float,
     expected: mi.Float | float = 1.0,
-) -> Rivals:
+) -> CompetingDensities:
     """Those of connecting a camera path that ends in ``one`` to a light path that ends in
     ``other``. The other parameters are those of :func:`joining_weight`, and:
 
     Parameters:
-        is_first: Is ``one``, and is ``other`` the first vertex of its subpath?
-        factor: 1 / (expected number of times they are connected), for ``Rivals.by_camera``: the
-            true number, not that which MIS weights assume.
+        is_first: Whether ``one``, and whether ``other``, is the first vertex of its subpath.
+        factor: 1 / (expected number of times they are connected), for
+            ``CompetingDensities.by_camera``: the true number, not the number that MIS weights
+            assume.
     """
     inverse = dr.rcp(squared_distance)
     to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
@@ -80,7 +81,7 @@ def joining_rivals(
     kinds = sums.by_kind(*ends, by_light=True)
     kinds += sums.by_kind(to_one, one.sums, one.reverse_pdf, is_first[0], by_light=False)
     kinds /= sums.count * sums.ratio(expected)
-    return Rivals(sums.by_camera(*ends) * factor, kinds)
+    return CompetingDensities(sums.by_camera(*ends) * factor, kinds)
 
 
 class LightSubpaths(Subpaths):
@@ -184,14 +185,14 @@ class LightSubpaths(Subpaths):
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._techniques is not None:
-            rivals = None
+            competing = None
             if self._sums.splits:
-                rivals = joining_rivals(
+                competing = joining_rivals(
                     self._sums, near_end, far_end, squared_distance,
                     (vertex.depth == 0, other.depth == 1), factor, chosen.expected,
                 )  # fmt: skip
             self._techniques.joined(
-                other.depth + 1, vertex.depth + 2, value, mis, rivals, visible
+                other.depth + 1, vertex.depth + 2, value, mis, competing, visible
             )
         if chosen.region is not None:
             self._observer.subpath(

@@ -13,7 +13,7 @@ from ...transport.path_decisions import SceneQuery
 from ...util.arrays import joined
 from .choice.technique_observer import TechniqueObserver
 from .light_vertices import LightVertices
-from .partial_sums import PartialSums, Rivals, weight
+from .partial_sums import CompetingDensities, PartialSums, weight
 from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
 
@@ -121,7 +121,7 @@ class LightImage:
         )
         importance = connection.importance * lens_weight
         value *= vertex.β * (importance * self._share)
-        mis, rivals = mi.Float(1), None
+        mis, competing = mi.Float(1), None
         if self._sums is not None:
             active &= self._sums.is_open(si, to_camera)
             # The density per area with which a camera ray finds the vertex, divided by the density
@@ -132,7 +132,7 @@ class LightImage:
             if self._sums.splits:
                 ends = found, vertex.history, reverse_pdf, vertex.depth == 1
                 kinds = self._sums.by_kind(*ends, by_light=True) / self._sums.image_count
-                rivals = Rivals(self._sums.by_camera(*ends), kinds)
+                competing = CompetingDensities(self._sums.by_camera(*ends), kinds)
             value *= mis
         # A connection that cannot contribute needs no shadow ray
         active &= dr.max(dr.abs(value)) > 0
@@ -148,7 +148,7 @@ class LightImage:
         finite = active & dr.all(dr.isfinite(value))
         if self._observer is not None:
             self._observer.splatted(
-                vertex.depth + 1, connection.position, value, mis, rivals, finite
+                vertex.depth + 1, connection.position, value, mis, competing, finite
             )
         return Splats(
             value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane

@@ -55,7 +55,7 @@ class Sums:
 
 
 @dataclass
-class Rivals:
+class CompetingDensities:
     """How densely the other techniques find a path that one technique has found: by kind, in units
     of the density of that technique times the number of its samples.
 
@@ -176,20 +176,20 @@ class PartialSums:
         others += camera.last + self.ratio(reverse_pdf) * camera.dVC
         return weight(others / self.merging)
 
-    def merging_rivals(
+    def competing_with_merging(
         self,
         light: Sums,
         pdf: mi.Float,
         camera: Sums,
         reverse_pdf: mi.Float,
         is_first: tuple[mi.Bool, mi.Bool],
-    ) -> Rivals:
+    ) -> CompetingDensities:
         """Those of merging. The parameters are those of :meth:`merging_weight`; ``is_first`` tells
         whether the light path's, and the camera path's vertex is its first one."""
         inverse, one = dr.rcp(self.merging), mi.Float(1)
         kinds = self.by_kind(one, light, pdf, is_first[0], by_light=True)
         kinds += self.by_kind(one, camera, reverse_pdf, is_first[1], by_light=False)
-        return Rivals(
+        return CompetingDensities(
             self.by_camera(self.root(inverse), light, pdf, is_first[0]), kinds * inverse
         )
 

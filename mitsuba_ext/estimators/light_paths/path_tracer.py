@@ -28,7 +28,7 @@ from .light_numbers import LightPathRays
 from .light_sums import LightSums
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .merging.merging import HANDFUL, MergedSubpaths
+from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths
 from .merging.merging_radius import MergingRadius
 from .merging.vertex_grid import VertexGrid
 from .partial_sums import PartialSums
@@ -109,7 +109,7 @@ class BidirectionalPathTracer:
             # Of paths of different times or wavelengths, those of one sample of each pixel merge
             paths = min(lanes, self.radius.pixels) if own_lane else light.count
             radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
-            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
+            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
             dr.make_opaque(merging)
         sums = PartialSums(
             dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,

@@ -153,16 +153,16 @@ def test_going_back_restores_the_guide_as_it_was() -> None:
     guide = GuideLearner.__new__(GuideLearner)
     guide.guide, guide.guidance = True, SimpleNamespace(efficiency=2.0)
     guide.finish = lambda: None
-    rivals = []
+    competing = []
 
     def choose(rival: Rival) -> LightPathChoice:
-        rivals.append(rival.efficiency)
+        competing.append(rival.efficiency)
         return LightPathChoice(Candidate(1.0, merges=True))
 
     trial = SimpleNamespace(
         choose=choose, leaves_out=lambda slot, finds_all_light: finds_all_light, check=None,
         can_be_guided=False, chosen_variance=0.1, path_variance=None,
-        reconsider=lambda rival, time, margin: rivals.append(rival.efficiency), effect=None,
+        reconsider=lambda rival, time, margin: competing.append(rival.efficiency), effect=None,
         __str__=lambda: "",
     )  # fmt: skip
     scene = load("caustic", width=96, height=54)
@@ -174,7 +174,7 @@ def test_going_back_restores_the_guide_as_it_was() -> None:
     )
     planner.learners["directions"], planner._next = guide, Stage(None)
     assert planner.next_stage().discards_earlier
-    assert rivals[0] > 2.5 and rivals[1] == pytest.approx(2.0)
+    assert competing[0] > 2.5 and competing[1] == pytest.approx(2.0)
 
 
 def test_auto_goes_back_to_its_earlier_choice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from ....util.arrays import from_numpy
-from ..merging.merging import HANDFUL
-from ..partial_sums import Rivals
+from ..merging.merging import PHOTONS_PER_DISK
+from ..partial_sums import CompetingDensities
 from .candidates import Candidate
 from .rare_contributions import BINS, bin_of
 
@@ -48,7 +48,7 @@ class CandidateMoments:
         self._block_of = block_of
         # MIS weights count a handful of vertices as one sample of a camera path; but these samples
         # share vertices
-        shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
+        shared = [samples_per_vertex.get(c.light_paths, 1.0) / PHOTONS_PER_DISK for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
         self._factors = from_numpy(mi.Float, [
             (c.light_paths**2, (c.light_paths > 0) * c.connections**2, c.merges, s)
@@ -60,13 +60,13 @@ class CandidateMoments:
 
     @dr.syntax
     def add(
-        self, brought, mis, rivals, pixel, active, count: float = 1.0, is_joined: bool = False
+        self, brought, mis, competing, pixel, active, count: float = 1.0, is_joined: bool = False
     ) -> None:
         """Adds a contribution.
 
         Parameters:
             brought: The contribution, with its MIS weight ``mis``.
-            rivals: Densities of techniques, that which found it included.
+            competing: Densities of techniques, that which found it included.
             pixel: Where it is.
             count: MIS weights count so many such contributions as one sample.
             is_joined: Did a connection of a camera path to a light path find it?
@@ -79,7 +79,7 @@ class CandidateMoments:
         index = mi.UInt32(0)
         while index < mi.UInt32(self._count):
             factors = dr.gather(mi.Vector4f, self._factors, index)
-            inverse, image, is_possible = _split(factors, rivals, dr.rcp(mis), is_joined)
+            inverse, image, is_possible = _split(factors, competing, dr.rcp(mis), is_joined)
             moment = square * inverse
             is_found = active & dr.isfinite(moment)
             place = 2 * (index * mi.UInt32(self._pixels) + pixel)
@@ -100,12 +100,12 @@ class CandidateMoments:
 
 
 def _split(
-    factors: mi.Vector4f, rivals: Rivals, total: mi.Float, is_joined: bool
+    factors: mi.Vector4f, competing: CompetingDensities, total: mi.Float, is_joined: bool
 ) -> tuple[mi.Float, mi.Float, mi.Bool]:
     """Σ cᵢ qᵢ³ / (Σ qᵢ²)² in units of the technique that found a path; the MIS weight of the light
     image; and whether the candidate can find the path. ``total`` is Σ qᵢ² of all techniques."""
-    connections, image = rivals.by_kind
-    hit, next_event = (dr.square(q) for q in rivals.by_camera)
+    connections, image = competing.by_kind
+    hit, next_event = (dr.square(q) for q in competing.by_camera)
     merging = dr.maximum(total - (hit + next_event + connections + image), 0)
     squares = [
         hit, next_event, factors.x * image, factors.y * connections, factors.z * merging

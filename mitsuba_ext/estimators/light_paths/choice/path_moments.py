@@ -15,8 +15,8 @@ from ....images.coarse_film import CoarseFilm
 from ....transport.estimator import CameraRays, Sample
 from ....transport.mis import power_heuristic
 from ....util.arrays import add_own, channel_mean, from_numpy
-from ..merging.merging import HANDFUL
-from ..partial_sums import Rivals
+from ..merging.merging import PHOTONS_PER_DISK
+from ..partial_sums import CompetingDensities
 from .candidate_moments import CandidateMoments
 from .candidates import Available, Candidate, candidates
 from .rare_contributions import BINS, Rare, error_of_render, rare
@@ -240,37 +240,38 @@ class PathMoments(TechniqueObserver):
         part = whole * power_heuristic(mi.Float(1), other)
         add_own(self._path, part, self._lane, active)
         add_own(self._squares, dr.square(part), self._lane, active)
-        rivals = Rivals(mi.Vector2f(1, other), self._by_kind)
-        self._moments.add(brought, mis, rivals, self._pixel, active)
+        competing = CompetingDensities(mi.Vector2f(1, other), self._by_kind)
+        self._moments.add(brought, mis, competing, self._pixel, active)
 
-    def joined(self, s, t, value, mis, rivals, active) -> None:
-        own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(1, 0))
+    def joined(self, s, t, value, mis, competing, active) -> None:
+        own = CompetingDensities(competing.by_camera, competing.by_kind + mi.Vector2f(1, 0))
         self._add_other(value, mis, own, active, is_joined=True)
         is_found = active & (t == 2) & dr.isfinite(mis)
         add_own(self._joined, self._brightness(value), self._lane, is_found)
 
-    def merged(self, value, mis, rivals, active) -> None:
-        self._add_other(value, mis, rivals, active, HANDFUL)
+    def merged(self, value, mis, competing, active) -> None:
+        self._add_other(value, mis, competing, active, PHOTONS_PER_DISK)
         square = dr.square(self._brightness(value))
         add_own(self._merged, square, self._lane, active & dr.isfinite(square))
 
     def _add_other(
-        self, value, mis, rivals, active, count: float = 1.0, is_joined: bool = False
+        self, value, mis, competing, active, count: float = 1.0, is_joined: bool = False
     ) -> None:
-        """Adds what the camera path in each lane found together with a light path. ``rivals`` holds
-        the technique itself. MIS weights count ``count`` such contributions as one sample."""
+        """Adds what the camera path in each lane found together with a light path. ``competing``
+        holds the technique itself. MIS weights count ``count`` such contributions as one
+        sample."""
         brought = self._brightness(value)
         active = active & (brought > 0)
-        self._moments.add(brought, mis, rivals, self._pixel, active, count, is_joined)
+        self._moments.add(brought, mis, competing, self._pixel, active, count, is_joined)
 
-    def splatted(self, s, position, value, mis, rivals, active) -> None:
+    def splatted(self, s, position, value, mis, competing, active) -> None:
         brought = channel_mean(value)
         active = active & (brought > 0)
         place = mi.Point2u(position - self._corner)
         pixel = self._place(place.y * self._film_width + place.x, active)
         dr.scatter_add(self._splats, brought, 2 * pixel, active)
         dr.scatter_add(self._splats, dr.square(brought), 2 * pixel + 1, active)
-        own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(0, 1))
+        own = CompetingDensities(competing.by_camera, competing.by_kind + mi.Vector2f(0, 1))
         self._moments.add(brought, mis, own, pixel, active)
 
     def _place(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.UInt32:

@@ -73,10 +73,10 @@ class TechniqueImages(TechniqueObserver):
         mis = dr.select(whole != 0, channel_mean(value) / whole, 0)
         self._add_own(mi.UInt32(1), vertex.depth + 2, value, mis, visible)
 
-    def joined(self, s, t, value, mis, rivals, active) -> None:
+    def joined(self, s, t, value, mis, competing, active) -> None:
         self._add_own(s, t, value, mis, active)
 
-    def splatted(self, s, position, value, mis, rivals, active) -> None:
+    def splatted(self, s, position, value, mis, competing, active) -> None:
         place = mi.Point2u(position - self._offset)
         pixel = place.y * self._width + place.x
         self._add(s, mi.UInt32(1), pixel, value, mis, active)

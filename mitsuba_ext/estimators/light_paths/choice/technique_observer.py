@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
 from ....transport.observer import Observer, Observers
-from ..partial_sums import Rivals
+from ..partial_sums import CompetingDensities
 from .candidates import Available
 
 
@@ -18,7 +18,7 @@ class TechniqueObserver(Observer):
     paths alone (s = 0 and 1) by the methods of :class:`Observer`.
 
     Attributes:
-        compares: Should the methods be given ``rivals``? They take three words of each stored
+        compares: Should the methods be given ``competing``? They take three words of each stored
             vertex. (They are ``None`` otherwise.)
     """
 
@@ -36,7 +36,7 @@ class TechniqueObserver(Observer):
         t: mi.UInt32,
         value: mi.Spectrum,
         mis: mi.Float,
-        rivals: Rivals | None,
+        competing: CompetingDensities | None,
         active: mi.Bool,
     ) -> None:
         """The camera path in each lane was connected to a light path (s, t ≥ 2). This adds
@@ -48,14 +48,18 @@ class TechniqueObserver(Observer):
         position: mi.Point2f,
         value: mi.Spectrum,
         mis: mi.Float,
-        rivals: Rivals | None,
+        competing: CompetingDensities | None,
         active: mi.Bool,
     ) -> None:
         """Vertices of light paths were connected to the sensor (t = 1). This adds ``value``, the
         MIS weight ``mis`` included, at a position on the film (``Splats``)."""
 
     def merged(
-        self, value: mi.Spectrum, mis: mi.Float, rivals: Rivals | None, active: mi.Bool
+        self,
+        value: mi.Spectrum,
+        mis: mi.Float,
+        competing: CompetingDensities | None,
+        active: mi.Bool,
     ) -> None:
         """The camera path in each lane was merged with a light path. This adds ``value`` to its
         radiance, the MIS weight ``mis`` included."""
@@ -73,7 +77,7 @@ class TechniqueObserver(Observer):
 
     def weighed(self, by_kind: mi.Vector2f) -> None:
         """A technique of camera paths alone has been weighed; its contribution is reported next
-        (``emission``, ``connection``). ``by_kind`` is that of :class:`Rivals`."""
+        (``emission``, ``connection``). ``by_kind`` is that of :class:`CompetingDensities`."""
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         """A pass has been traced. ``camera`` holds the samples of camera paths, connections to

@@ -46,7 +46,7 @@ PILOT_PATHS, DOUBLINGS = 1 << 16, 8
 #: they share a camera path, and other techniques often vary less than their densities tell. (With
 #: weights that count each vertex, the variance is 1.1 to 1.2 times as large in glass_lamp, pool and
 #: caustic; with fewer than a tenth of them, it stays about the same.)
-HANDFUL = 8.0
+PHOTONS_PER_DISK = 8.0
 
 #: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
 #: of a pixel, in footprints of pixels.
@@ -133,7 +133,7 @@ def suitable_radius(
     if only_caustic:
         kept = vertices.is_caustic
     least = 2 * footprint or scene_diagonal(scene) / 500
-    return disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, least)
+    return disk_radius(vertices, kept, PHOTONS_PER_DISK * PILOT_PATHS / pixels, least)
 
 
 def pilot_vertices(
@@ -280,7 +280,7 @@ class MergedSubpaths(Subpaths):
         # Flux arrives per area of the surface; the value holds the shading cosine
         arrives = geometric_cosine(far, far.wi)
         value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
-        mis, rivals = mi.Float(1), None
+        mis, competing = mi.Float(1), None
         if self._sums is not None:
             reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
             ends = other.history, pdf, vertex.path.history, reverse
@@ -288,7 +288,7 @@ class MergedSubpaths(Subpaths):
             value *= mis
             if self._sums.splits:
                 is_first = other.depth == 1, vertex.depth == 0
-                rivals = self._sums.merging_rivals(*ends, is_first)
+                competing = self._sums.competing_with_merging(*ends, is_first)
         active &= dr.all(dr.isfinite(value))
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
@@ -296,5 +296,5 @@ class MergedSubpaths(Subpaths):
                 carried = value * vertex.path.β * (arrives / pdf)
                 self._observer.photon(brought, carried, other.history, active & (pdf > 0))
             else:
-                self._observer.merged(brought, mis, rivals, active)
+                self._observer.merged(brought, mis, competing, active)
         return dr.select(active, value, 0)

@@ -32,8 +32,8 @@ from ..merging.merging import (
     BATCH,
     DOUBLINGS,
     FEW,
-    HANDFUL,
     LARGEST,
+    PHOTONS_PER_DISK,
     PILOT_PATHS,
     MergedSubpaths,
     pilot_vertices,
@@ -216,6 +216,6 @@ def suitable_ball(
         if others > 4:
             break
     per_volume = max(others, 1e-6) / (2 * radius) ** 3
-    count = HANDFUL * PILOT_PATHS / pixels
+    count = PHOTONS_PER_DISK * PILOT_PATHS / pixels
     found = (count / (4 / 3 * math.pi * per_volume)) ** (1 / 3)
     return min(found, widest_ball(scene, footprint))

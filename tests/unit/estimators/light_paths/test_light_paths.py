@@ -254,16 +254,16 @@ def test_weights_follow_from_the_densities_that_light_paths_know(
             dr.eval(self.count)
             counts.append(self.count)
 
-        def joined(self, s, t, value, mis, rivals, active) -> None:
-            self._compare(s, mis, rivals, active)
-            super().joined(s, t, value, mis, rivals, active)
+        def joined(self, s, t, value, mis, competing, active) -> None:
+            self._compare(s, mis, competing, active)
+            super().joined(s, t, value, mis, competing, active)
 
-        def splatted(self, s, position, value, mis, rivals, active) -> None:
-            self._compare(s, mis, rivals, active)
-            super().splatted(s, position, value, mis, rivals, active)
+        def splatted(self, s, position, value, mis, competing, active) -> None:
+            self._compare(s, mis, competing, active)
+            super().splatted(s, position, value, mis, competing, active)
 
-        def _compare(self, s, mis, rivals, active) -> None:
-            error = dr.abs(mis * (1 + dr.squared_norm(rivals.by_camera)) - 1)
+        def _compare(self, s, mis, competing, active) -> None:
+            error = dr.abs(mis * (1 + dr.squared_norm(competing.by_camera)) - 1)
             index = dr.select((s == length) & (error < 2e-3), mi.UInt32(0), 1)
             dr.scatter_add(self.count, mi.UInt32(1), index, active & (mis < 0.99))
 
