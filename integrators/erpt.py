@@ -165,7 +165,7 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     @property
     def has_paths(self) -> bool:
-        """Do chains change light paths, not primary samples?"""
+        """Whether chains change light paths, not primary samples."""
         return self.mutations == "path"
 
     def _refuse_primary(self, props: mi.Properties) -> None:

@@ -117,7 +117,7 @@ class Variance(mi.AdjointIntegrator):
     film_counts_samples = False
 
     def __init__(self, props: mi.Properties) -> None:
-        # Without properties, because those of the base class would have no effect here
+        # Without properties, because the base class would read some that have no effect here
         super().__init__(mi.Properties(props.plugin_name()))
         self.name = props.plugin_name()
         self.batch_count = read_parameter(

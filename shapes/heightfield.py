@@ -267,8 +267,8 @@ class _Geometry(Lightweight):
         values: The heights. Shape (rows, columns).
         unit: The height of the value 1.
         to_world: From the square [-1, 1]² and heights to world space. Shape (4, 4).
-        has_normals: Are shading normals interpolated?
-        is_flipped: Do normals point to lower heights?
+        has_normals: Whether shading normals are interpolated.
+        is_flipped: Whether normals point to lower heights.
 
     Raises:
         ValueError: Nothing can be transformed to the space of the grid.

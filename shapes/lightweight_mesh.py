@@ -133,7 +133,7 @@ class LightweightMesh(mi.Mesh):
         try:
             span(self, box.min, box.max)
         except RuntimeError:
-            # Mitsuba would now make this shape that of the emitter, which already has one: the
+            # Mitsuba would now make this the shape of the emitter, which already has one: the
             # mesh. That is what we need. All else is done by then.
             if not mesh.is_emitter():
                 raise

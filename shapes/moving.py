@@ -218,5 +218,5 @@ class Moving(mi.Mesh):
 
 
 def _has_extent(shape: mi.Shape) -> bool:
-    """Does the shape itself occupy space? A shapegroup does so only through its instances."""
+    """Whether the shape itself occupies space. A shapegroup does so only through its instances."""
     return shape.class_name() != "ShapeGroupPlugin" and shape_bounds(shape).valid()
