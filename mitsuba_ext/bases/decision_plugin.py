@@ -18,7 +18,7 @@ class DecisionPlugin(mi.Sampler):
 
     Attributes:
         kind: The class that reads the parameters of the scene.
-        decision_parameters: The parameters that were read.
+        technique: The parameters that were read.
     """
 
     kind: type[Technique]

@@ -114,10 +114,10 @@ class StoredArrays:
         self._check_text(name, longest)
         return str(self.take(name, "U"))
 
-    def texts(self, name: str, most: int = 1 << 12, longest: int = 1 << 10) -> tuple[str, ...]:
-        """Reads at most ``most`` texts of at most ``longest`` characters."""
-        self._check_text(name, longest)
-        return tuple(self.take(name, "U", (None,), longest=most).tolist())
+    def texts(self, name: str) -> tuple[str, ...]:
+        """Reads up to 4096 texts of up to 1024 characters each."""
+        self._check_text(name, 1 << 10)
+        return tuple(self.take(name, "U", (None,), longest=1 << 12).tolist())
 
     def require(self, condition: bool, fault: str) -> None:
         """

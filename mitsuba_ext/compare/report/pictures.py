@@ -42,7 +42,7 @@ class Picture:
         run: The run that rendered it; ``None`` for the reference.
         pixels: 8-bit sRGB, (height, width, 3).
         image: ``pixels`` as a URI.
-        error: Mean relative squared error of every pixel over ``run_count`` runs, (height, width);
+        error: Mean relative squared error of every pixel over the runs, (height, width);
             ``None`` without a reference.
         error_map: ``error`` in colours, as a URI; empty if ``error`` is ``None``.
     """
@@ -54,7 +54,6 @@ class Picture:
     image: str
     error: np.ndarray | None = None
     error_map: str = ""
-    run_count: int = 0
 
 
 @dataclass
@@ -89,7 +88,7 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
 
     # One image per integrator stays in memory until the exposure is known, which comes from the
     # reference or, without one, from the first image. Errors are summed run by run.
-    waiting: list[tuple[Record, Record, np.ndarray, np.ndarray | None, int]] = []
+    waiting: list[tuple[Record, Record, np.ndarray, np.ndarray | None]] = []
     for integrator in scene["integrators"]:
         first, total, count = None, None, 0
         for run in pictured_runs(integrator, level):
@@ -106,7 +105,7 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
                 count += 1
         if first is not None:
             mean = None if total is None else total / count
-            waiting.append((integrator, *first, mean, count))
+            waiting.append((integrator, *first, mean))
     if shape is None:
         return result
 
@@ -115,13 +114,12 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
     if reference is not None:
         pixels = tone_map(reference, result.exposure)
         result.pictures.append(Picture("reference", None, None, pixels, png(pixels)))
-    result.limits = color_limits([error for *_, error, _ in waiting if error is not None])
-    for integrator, run, linear, error, count in waiting:
+    result.limits = color_limits([error for *_, error in waiting if error is not None])
+    for integrator, run, linear, error in waiting:
         pixels = tone_map(linear, result.exposure)
         picture = Picture(integrator["label"], integrator, run, pixels, png(pixels), error)
         if error is not None and result.limits is not None:
             picture.error_map = png(color_indices(error, result.limits), color_table())
-            picture.run_count = count
         result.pictures.append(picture)
     return result
 

@@ -110,12 +110,12 @@ class LevelView:
         return dr.gather(mi.Vector4f, self.data, self.start + mi.UInt32(row * self.width + column))
 
 
-def halved(kind: type[T], flat: mi.Float, size: Size, start: mi.UInt32 | int = 0) -> T:
-    """Means of 2 × 2 pixels of an image that begins at the pixel ``start`` of ``flat``."""
+def halved(kind: type[T], flat: mi.Float, size: Size) -> T:
+    """Means of 2 × 2 pixels of an image."""
     _index, position = size.half().pixels()
     total = kind(0)
     for at in _four(size, 2 * position):
-        total += dr.gather(kind, flat, start + at)
+        total += dr.gather(kind, flat, at)
     return 0.25 * total
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
-from ....transport.observer import Observer, Observers
+from ....transport.observer import Observer
 from ..partial_sums import CompetingDensities
 from .candidates import Available
 
@@ -82,44 +81,3 @@ class TechniqueObserver(Observer):
     def traced(self, camera: Sample, whole: Sample) -> None:
         """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
         light paths included; ``whole`` those of all techniques."""
-
-
-class TechniqueObservers(Observers):
-    """Passes each call on to several observers."""
-
-    def __init__(self, observers: Sequence[TechniqueObserver]) -> None:
-        super().__init__(observers)
-        self._techniques = observers
-        self.compares = any(o.compares for o in observers)
-
-    def start(self, rays: CameraRays, available: Available) -> None:
-        for observer in self._techniques:
-            observer.start(rays, available)
-
-    def joined(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.joined(*arguments)
-
-    def splatted(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.splatted(*arguments)
-
-    def merged(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.merged(*arguments)
-
-    def photon(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.photon(*arguments)
-
-    def searched(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.searched(*arguments)
-
-    def weighed(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.weighed(*arguments)
-
-    def traced(self, *arguments: Any) -> None:
-        for observer in self._techniques:
-            observer.traced(*arguments)
