@@ -97,7 +97,7 @@ class ReweightedCamera(WrappingIntegrator):
         return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule
 
     def parameters(self) -> dict[str, Any]:
-        return {**self.numbers.parameters(), "nested": self.nested_text()}
+        return {**self.numbers.parameters(), **super().parameters()}
 
 
 def _purposes(integrator: mi.Integrator) -> list[str]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext.bases.wrapping_integrator import WrappingIntegrator
@@ -129,7 +127,9 @@ class AdaptiveSampling(WrappingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.threshold = self.parameter(props, "threshold", 0.0, minimum=0.0)
-        self.pass_spp = self.parameter(props, "pass_spp", 0, minimum=0, maximum=MOST_SPP)
+        self.pass_spp = self.parameter(
+            props, "pass_spp", 0, none="an eighth", minimum=0, maximum=MOST_SPP
+        )
         self.counts_samples = self.parameter(props, "count_samples", False)
         self.refuse_equal_samples("pixels cannot get different numbers of samples of {nested}")
 
@@ -139,14 +139,6 @@ class AdaptiveSampling(WrappingIntegrator):
     @property
     def needs_equal_samples(self) -> str:
         return "they are distributed already"
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "threshold": self.threshold,
-            "pass_spp": self.pass_spp or "an eighth",
-            "count_samples": self.counts_samples,
-            "nested": self.nested_text(),
-        }
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         return render(self, scene, sensor, seed, spp, develop, evaluate, AdaptiveJob)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -134,10 +133,14 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.aperture_radius = self.parameter(props, "aperture_radius", 0.0, minimum=0.0)
-        self.focus_distance = self.parameter(props, "focus_distance", 0.0, minimum=0.0)
+        self.aperture_radius, self.focus_distance = (
+            self.parameter(props, key, 0.0, none="of the sensor", minimum=0.0)
+            for key in ("aperture_radius", "focus_distance")
+        )
         self.filter = self.parameter(props, "filter", "lens", choices=tuple(FILTERS))
-        self.hidden_spp = self.parameter(props, "hidden_spp", 0, minimum=0, maximum=MOST_SPP)
+        self.hidden_spp = self.parameter(
+            props, "hidden_spp", 0, none="half", minimum=0, maximum=MOST_SPP
+        )
         self.denoise = self.parameter(props, "denoise", False)
         if self.denoise:
             denoiser()
@@ -150,16 +153,6 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     @property
     def needs_equal_samples(self) -> str:
         return "a filter makes its picture"
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "aperture_radius": self.aperture_radius or "of the sensor",
-            "focus_distance": self.focus_distance or "of the sensor",
-            "filter": self.filter,
-            "hidden_spp": self.hidden_spp or "half",
-            "denoise": self.denoise,
-            "nested": self.nested_text(),
-        }
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self._is_rendering = True

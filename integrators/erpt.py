@@ -10,7 +10,6 @@ from mitsuba_ext.bases.metropolis_integrator import MetropolisIntegrator
 from mitsuba_ext.bases.path_mutations import (
     MOST,
     camera_samples,
-    described,
     path_target,
     read_switches,
 )
@@ -196,17 +195,6 @@ class EnergyRedistribution(MetropolisIntegrator):
         return RedistributionRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
-        parameters = {
-            **super().parameters(),
-            "mutations": self.mutations,
-            "outliers": self.outliers,
-            "mutations_per_pixel": self.mutations_per_pixel,
-            "chain_length": self.chain_length,
-            "luminance_samples": self.luminance_samples,
-            "proposal_filter": self.filters.width,
-            "most_consecutive": self.filters.most_consecutive,
-        }
-        if not self.has_paths:
-            return parameters
-        common = {key: value for key, value in parameters.items() if key not in _PRIMARY}
-        return {**common, **described(self.switches)}
+        shown = super().parameters()
+        # With mutations of paths, those of primary samples have no effect
+        return {k: v for k, v in shown.items() if not (self.has_paths and k in _PRIMARY)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 
@@ -198,18 +197,6 @@ class InstantRadiosityIntegrator(WalkIntegrator):
             slots["subpath_selection"] = LearnedSubpaths()
         self.fill(props, **slots)
         self._tally, self._largest = Tally(), math.inf
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "light_paths": self.light_paths,
-            "interleaving": self.interleaving,
-            "connections": self.connections,
-            "choice": self.choice,
-            "bound": self.bound,
-            "compensation": self.compensation,
-            "light_aovs": self.light_aovs,
-            **super().parameters(),
-        }
 
     @property
     def sample_cost(self) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import time
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 
@@ -154,7 +153,7 @@ class IrradianceCache(WalkIntegrator):
         )
         self.effort = self.parameter(props, "effort", 0.5, minimum=0.0, maximum=1e6)
         self.max_share = self.parameter(props, "max_share", 0.1, minimum=0.001, maximum=1.0)
-        self.cache_file = self.parameter(props, "cache_file", "")
+        self.cache_file = self.parameter(props, "cache_file", "", none="none")
         #: The records of the last render, and what each round of it did.
         self.records, self.rounds = Records.none(3), []
         if self.min_spacing > self.max_spacing:
@@ -164,18 +163,6 @@ class IrradianceCache(WalkIntegrator):
             )
         slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
         self.fill(props, **slots)
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "accuracy": self.accuracy,
-            "min_spacing": self.min_spacing,
-            "max_spacing": self.max_spacing,
-            "gather_samples": self.gather_samples,
-            "effort": self.effort,
-            "max_share": self.max_share,
-            "cache_file": self.cache_file or "none",
-            **super().parameters(),
-        }
 
     # ---- The render ----
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
@@ -115,9 +113,6 @@ class LightTracerIntegrator(WalkIntegrator):
         )
         self.fill(props)
         self._has_warned = False
-
-    def parameters(self) -> dict[str, Any]:
-        return {"lens_sampling": self.lens_sampling, **super().parameters()}
 
     @property
     def sample_cost(self) -> int:

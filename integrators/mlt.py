@@ -11,7 +11,6 @@ from mitsuba_ext.bases.long_chains import LongChains
 from mitsuba_ext.bases.path_mutations import (
     MOST,
     camera_samples,
-    described,
     path_target,
     read_switches,
 )
@@ -113,10 +112,3 @@ class PathMetropolis(ChainIntegrator):
 
     def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
         return self.long_chains.render(self, target, seed, *render)
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            **super().parameters(),
-            **self.long_chains.parameters(),
-            **described(self.switches),
-        }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -131,7 +130,7 @@ class PhotonMapping(WalkIntegrator):
             )
         self.lookup_size = self.parameter(props, "lookup_size", 30, minimum=1)
         self.radii = {
-            name: self.parameter(props, f"{name}_radius", 0.0, minimum=0.0)
+            name: self.parameter(props, f"{name}_radius", 0.0, none="automatic", minimum=0.0)
             for name in _MAPS
         }
         self.photon_aovs = self.parameter(props, "photon_aovs", False)
@@ -139,17 +138,6 @@ class PhotonMapping(WalkIntegrator):
         self.maps = PhotonMaps()
         slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
         self.fill(props, **slots)
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "photons": self.photons,
-            "final_gather": self.final_gather,
-            "guided": self.guided,
-            "lookup_size": self.lookup_size,
-            **{f"{name}_radius": value or "automatic" for name, value in self.radii.items()},
-            "photon_aovs": self.photon_aovs,
-            **super().parameters(),
-        }
 
     def schedule(self, scene, sensor, samples, seed, learning):
         self.maps = self._traced(scene, sensor, seed)

@@ -103,7 +103,7 @@ class PSSGuided(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        connects_first = self.parameter(props, "nee_first_bounce", True)
+        connects_first = self.reader(props)("nee_first_bounce", True)
         none = None if connects_first else ParameterReader.of_defaults(self.name, count=0)
         self.fill(
             props,

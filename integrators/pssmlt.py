@@ -93,10 +93,3 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
     def chain_render(self, target: ImageTarget, seed: int, *render: Any) -> MetropolisRender:
         return self.long_chains.render(self, target, seed, *render)
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            **super().parameters(),
-            **self.long_chains.parameters(),
-            "kelemen_style_weights": self.long_chains.uses_uniform,
-        }

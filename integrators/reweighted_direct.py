@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
@@ -88,6 +86,3 @@ class ReweightedDirect(WalkIntegrator):
     @property
     def default_spp(self) -> int:
         return self.camera_samples
-
-    def parameters(self) -> dict[str, Any]:
-        return {"camera_samples": self.camera_samples, **super().parameters()}

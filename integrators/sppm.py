@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import mitsuba as mi
 
@@ -113,18 +112,13 @@ class ProgressivePhotonMapping(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters.read(self, props)
-        self.radius_in_media = self.parameter(props, "radius_in_media", 0.0, minimum=0.0)
+        self.radius_in_media = self.parameter(
+            props, "radius_in_media", 0.0, none="automatic", minimum=0.0
+        )
         self.light_paths = self.parameter(
             props, "light_paths", 1.0, minimum=1 / MOST_PATHS, maximum=MOST_PATHS
         )
         self.fill(props)
-
-    def parameters(self) -> dict[str, Any]:
-        own = {
-            "radius_in_media": self.radius_in_media or "automatic",
-            "light_paths": self.light_paths,
-        }
-        return {**self.merging.parameters(), **own, **super().parameters()}
 
     @property
     def needs_equal_samples(self) -> str:

@@ -155,7 +155,6 @@ class SwarmPath(WalkIntegrator):
         is_wanted = {
             key: self.parameter(props, key, key not in _OFF_BY_DEFAULT) for key in _SLOTS
         }
-        self._shown = {**is_wanted, "always_use": always}
         # Slots are filled even if the scene does not use their numbers
         self.fill(
             props,
@@ -165,6 +164,3 @@ class SwarmPath(WalkIntegrator):
                 if is_wanted[key]
             },
         )
-
-    def parameters(self):
-        return {**super().parameters(), **self._shown}

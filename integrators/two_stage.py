@@ -102,6 +102,3 @@ class TwoStage(WalkIntegrator):
             slots["connections"] = Connections(ParameterReader.of_defaults(self.name, **values))
         self.light_samples = light_samples
         self.fill(props, **slots)
-
-    def parameters(self) -> dict[str, Any]:
-        return {"light_samples": self.light_samples, **super().parameters()}

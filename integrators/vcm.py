@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext.bases.bidirectional_integrator import BidirectionalIntegrator
@@ -109,6 +107,6 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     def merges_all(self) -> bool:
         return self.where == "all"
 
-    def parameters(self) -> dict[str, Any]:
-        radius = self.merging.parameters() if self.merging else {}
-        return {"merging": self.where, **radius, **super().parameters()}
+    def parameters(self):
+        shown = super().parameters()
+        return shown if self.merging else {k: v for k, v in shown.items() if "radius" not in k}

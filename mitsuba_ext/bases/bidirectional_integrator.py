@@ -190,7 +190,7 @@ class BidirectionalIntegrator(LightPathIntegrator):
         self.connections = self.parameter(props, "connections", 1, minimum=0, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
         self.sample_direct = self.parameter(props, "sample_direct", True)
-        self.technique_images = self.parameter(props, "technique_images", "")
+        self.technique_images = self.parameter(props, "technique_images", "", none="none")
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
         without_direct = ("next_event", "shadow_test", "light_paths")
         without_images = ("light_paths",) if self.technique_images else ()
@@ -215,14 +215,7 @@ class BidirectionalIntegrator(LightPathIntegrator):
             )
 
     def parameters(self) -> dict[str, Any]:
-        return {
-            "connections": self.connections,
-            "light_image": self.light_image,
-            "sample_direct": self.sample_direct,
-            "technique_images": self.technique_images or "none",
-            "light_paths": "always",
-            **super().parameters(),
-        }
+        return {"light_paths": "always", **super().parameters()}
 
 
 class Once:

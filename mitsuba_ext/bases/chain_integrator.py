@@ -136,10 +136,6 @@ class ChainIntegrator(WalkIntegrator):
         """The target distribution of the chains; ``None`` if no path is left for them to find."""
         raise NotImplementedError
 
-    def parameters(self) -> dict[str, Any]:
-        file = {"chain_file": self.chain_file} if self.chain_file else {}
-        return {"direct_samples": self.direct_samples, **file, **super().parameters()}
-
     @property
     def finds_direct(self) -> bool:
         """Do camera samples find direct light?"""

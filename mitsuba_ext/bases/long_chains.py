@@ -48,15 +48,6 @@ class LongChains:
             integrator.parameter(props, "two_stage", False),
         )
 
-    def parameters(self) -> dict[str, Any]:
-        """What ``str()`` of the integrator shows."""
-        return {
-            "chains": self.chains,
-            "p_large": self.p_large,
-            "luminance_samples": self.luminance_samples,
-            "two_stage": self.two_stage,
-        }
-
     def render(
         self,
         integrator: ChainIntegrator,

@@ -6,7 +6,6 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 
@@ -57,12 +56,6 @@ class MetropolisIntegrator(ChainIntegrator):
                 f"pilots; chains need a choice that does not, such as \"spatial\""
             )
         return parameters
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "bidirectional": self.bidirectional,
-            **super().parameters(),
-        }
 
     def target(self, setting: Setting) -> ImageTarget | None:
         """The target distribution of the chains; ``None`` if no path is left for them to find."""

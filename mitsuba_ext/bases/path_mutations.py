@@ -38,11 +38,6 @@ def read_switches(integrator: Any, props: mi.Properties, **defaults: bool) -> Sw
     return Switches(**chosen)
 
 
-def described(switches: Switches) -> dict[str, bool]:
-    """The values of the parameters that switch mutations, by name."""
-    return {key: getattr(switches, name) for key, name in _SWITCHES.items()}
-
-
 def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTarget | None:
     """The target distribution of chains of paths; ``None`` if no path is left for them to find."""
     scene, sensor = setting.scene, setting.sensor

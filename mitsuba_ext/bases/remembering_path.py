@@ -72,8 +72,7 @@ class RememberingPath(WalkIntegrator):
 
     def parameters(self) -> dict[str, Any]:
         words = {slot: next(iter(SLOTS[slot])) for slot in _SLOTS}
-        every = {"learn_every": self.learn_every} if self.can_learn else {}
-        return {**words, **super().parameters(), **every}
+        return {**words, **super().parameters()}
 
     def common_parameters(self) -> dict[str, Any]:
         known = super().common_parameters()

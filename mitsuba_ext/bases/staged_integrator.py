@@ -72,13 +72,16 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
+        self._own: dict[str, Any] = {}
         # Read before the base class reads them, as its errors do not name the plugin
-        self.timeout = self.parameter(props, "timeout", -1.0)
-        self.parameter(props, "hide_emitters", False)
+        self.timeout = read_parameter(self.name, props, "timeout", -1.0)
+        read_parameter(self.name, props, "hide_emitters", False)
         super().__init__(props)
         # Deprecated by Mitsuba, which warns in the log
-        self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
-        self.checkpoint = self.parameter(props, "checkpoint", "")
+        self.samples_per_pass = read_parameter(
+            self.name, props, "samples_per_pass", NO_LIMIT, minimum=1
+        )
+        self.checkpoint = read_parameter(self.name, props, "checkpoint", "")
         if self.checkpoint:
             self.checkpoint_every = self._interval(props)
         self._is_batch = False
@@ -136,8 +139,9 @@ class StagedIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:
-        """The parameters that ``str()`` shows besides the common ones."""
-        return {}
+        """The parameters that ``str()`` shows besides the common ones: those that
+        :meth:`parameter` has read, without empty texts."""
+        return {key: value for key, value in self._own.items() if value != ""}
 
     def common_parameters(self) -> dict[str, Any]:
         """The parameters that ``str()`` shows of all integrators with this base class."""
@@ -193,7 +197,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
             self.is_cancelled = False
 
     def _interval(self, props: mi.Properties) -> Interval:
-        text = self.parameter(props, "checkpoint_every", "60s")
+        text = read_parameter(self.name, props, "checkpoint_every", "60s")
         try:
             return Interval.parse(text)
         except ValueError as error:
@@ -243,10 +247,18 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- Helpers ----
 
-    def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
-        """Reads and checks a parameter of the scene: see
-        :func:`mitsuba_ext.util.parameters.read_parameter`, also for what ``accepted`` can be."""
-        return read_parameter(self.name, props, key, default, **accepted)
+    def parameter(
+        self, props: mi.Properties, key: str, default: Any, none: str = "", **accepted: Any
+    ) -> Any:
+        """Reads and checks a parameter of the scene, which ``str()`` then shows: see
+        :func:`mitsuba_ext.util.parameters.read_parameter`, also for what ``accepted`` can be.
+
+        Parameters:
+            none: What ``str()`` shows in the place of 0 and of an empty text.
+        """
+        value = read_parameter(self.name, props, key, default, **accepted)
+        self._own[key] = (value or none) if none else value
+        return value
 
     def _checked(self, scene: Any, spp: Any) -> int:
         """The argument ``spp`` of :meth:`render`.

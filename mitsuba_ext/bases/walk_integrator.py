@@ -86,10 +86,11 @@ class WalkIntegrator(StagedIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        max_depth = self.parameter(props, "max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
+        read = self.reader(props)
+        max_depth = read("max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
         self.max_depth = max_depth if max_depth >= 0 else NO_LIMIT
-        self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=NO_LIMIT)
-        self.aovs = self.parameter(props, "aovs", "")
+        self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
+        self.aovs = read("aovs", "")
         self._aovs = self._aov_integrator(self.aovs)
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
@@ -125,10 +126,11 @@ class WalkIntegrator(StagedIntegrator):
                 )
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
-            self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
-            self.save_learned = self.parameter(props, "save_learned", "")
-            self.load_learned = self.parameter(props, "load_learned", "")
-            self.keep_learned = self.parameter(props, "keep_learned", False)
+            read = self.reader(props)
+            self._pilot_spp = read("pilot_spp", max(wishes), minimum=0)
+            self.save_learned = read("save_learned", "")
+            self.load_learned = read("load_learned", "")
+            self.keep_learned = read("keep_learned", False)
             for key in ("save_learned", "keep_learned"):
                 if self.load_learned and getattr(self, key):
                     raise ValueError(
@@ -150,7 +152,7 @@ class WalkIntegrator(StagedIntegrator):
             "keep_learned": self.keep_learned or "",
         }
         given = {key: value for key, value in learning.items() if value not in (None, "")}
-        return {**self._described_slots(), **given}
+        return {**super().parameters(), **self._described_slots(), **given}
 
     def check_target(
         self, key: str, file: str, check: Callable[[Path], None] = learned_file.check_target

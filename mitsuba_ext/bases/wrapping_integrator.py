@@ -6,6 +6,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mitsuba as mi
 
@@ -61,11 +62,12 @@ class WrappingIntegrator(StagedIntegrator):
             name = f'"{self.nested.name}"'
             raise ValueError(f'"{self.name}": {reason.format(nested=name)}: {why}')
 
-    def nested_text(self) -> str:
-        """The nested integrator, indented for ``str()``."""
-        return str(self.nested).replace("\n", "\n  ")
 
     # ---- What the base class calls ----
+
+    def parameters(self) -> dict[str, Any]:
+        nested = str(self.nested).replace("\n", "\n  ")
+        return {**super().parameters(), "nested": nested}
 
     def plan_learning(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf

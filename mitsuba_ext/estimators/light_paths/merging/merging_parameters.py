@@ -43,13 +43,9 @@ class MergingParameters:
     def read(cls, integrator: Any, props: mi.Properties) -> MergingParameters:
         """Reads ``radius`` and ``radius_decay``."""
         return cls(
-            integrator.parameter(props, "radius", 0.0, minimum=0.0),
+            integrator.parameter(props, "radius", 0.0, none="automatic", minimum=0.0),
             integrator.parameter(props, "radius_decay", 0.75, minimum=0.01, maximum=1.0),
         )
-
-    def parameters(self) -> dict[str, Any]:
-        """What ``str()`` of the integrator shows."""
-        return {"radius": self.radius or "automatic", "radius_decay": self.decay}
 
     def radius_of(
         self,
