@@ -49,6 +49,7 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
 
     def parameters(frame: int) -> FrameParameters:
         from ..inputs.scene_values import as_text
+        from ..inputs.scenes import as_xml
 
         try:
             found = function(frame)
@@ -56,7 +57,7 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
             raise InputError(f"{text}: frame {frame}: {type(error).__name__}: {error}") from error
         if not isinstance(found, Mapping) or not all(isinstance(key, str) for key in found):
             raise InputError(f"{text}: frame {frame}: must return a dict with names as keys")
-        definitions = {key: _as_xml(value) for key, value in found.items() if "." not in key}
+        definitions = {key: as_xml(value) for key, value in found.items() if "." not in key}
         try:
             values = as_text({key: value for key, value in found.items() if "." in key})
         except InputError as error:
@@ -64,10 +65,6 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
         return FrameParameters(definitions, values)
 
     return parameters
-
-
-def _as_xml(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _module(source: str) -> Any:

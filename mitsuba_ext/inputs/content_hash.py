@@ -6,15 +6,12 @@ import hashlib
 import inspect
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..scene.parameter_values import values_of
 from ..startup import plugin_folders
-
-if TYPE_CHECKING:
-    pass
 
 _PACKAGE = Path(__file__).parents[1]
 

@@ -170,7 +170,7 @@ def load_scene(
     check_source(source)
     path = None if is_dict else Path(source)
     label = "the scene" if is_dict else str(path)
-    strings = {key: _as_xml(value) for key, value in (parameters or {}).items()}
+    strings = {key: as_xml(value) for key, value in (parameters or {}).items()}
     if is_dict and strings:
         raise InputError(f"a scene from a dict has no $parameters: found {', '.join(strings)}")
     config = mi.parser.ParserConfig(mi.variant())
@@ -257,7 +257,8 @@ def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
     return {key: copy(value) for key, value in source.items()}
 
 
-def _as_xml(value: object) -> str:
+def as_xml(value: object) -> str:
+    """The text of a value in a scene file."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...rendering.film_tiles import FilmTiles
 from ...util.arrays import joined
 from ...util.stored_arrays import StoredArrays
 from .path_records import PathRecords
@@ -36,12 +37,8 @@ class TileRegions:
     """
 
     def __init__(self, width: int, height: int, tile: int) -> None:
-        self._rows, self._columns = -(-height // tile), -(-width // tile)
-        self.count = self._rows * self._columns
-        # Opaque: films of all sizes share the kernels
-        self._width, self._tile, self._tiles_across = (
-            dr.opaque(mi.UInt32, x) for x in (width, tile, self._columns)
-        )
+        self._tiles = FilmTiles(width, height, tile)
+        self.count = self._tiles.count
 
     def state(self) -> dict[str, np.ndarray]:
         """The arrays that depend on the pilots: none."""
@@ -59,8 +56,7 @@ class TileRegions:
 
     def begin(self, pixel: mi.UInt32) -> mi.UInt32:
         """The tree of the first bounce: the tile's."""
-        y = pixel // self._width
-        return y // self._tile * self._tiles_across + (pixel - y * self._width) // self._tile
+        return self._tiles.tile(pixel)
 
     def tree(self, state: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The tree of a vertex."""
@@ -136,10 +132,10 @@ class TileRegions:
     def _add_tiles(self, builder: TreeBuilder, samples: Samples, tile: mi.UInt32) -> mi.UInt32:
         """Adds the trees of all tiles, large tiles first; returns the roots of the small
         ones."""
-        row, column = np.divmod(np.arange(self.count, dtype=np.uint32), self._columns)
+        row, column = np.divmod(np.arange(self.count, dtype=np.uint32), self._tiles.columns)
         number, roots = np.zeros(self.count, np.uint32), None
         for group in _GROUPS:
-            across = -(-self._columns // group)
+            across = -(-self._tiles.columns // group)
             new = (row // group * across + column // group).astype(np.uint32)
             size = int(new[-1]) + 1
             if roots is not None:

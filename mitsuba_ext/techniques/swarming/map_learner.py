@@ -13,18 +13,21 @@ from ...planning.costs import SWARMING
 from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import brightness
 from ...planning.prediction import Effect, Prediction
+from ...rendering.film_tiles import FilmTiles
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .cells import CellDensities, Cells
 from .estimate import Form, Grid, Shares, estimate
-from .film_tiles import FilmTiles
 from .tile_counts import Candidate, Choices, TileCounts
 
 #: The forms of densities from which one is chosen; and the form before their gains are measured.
 _FORMS = (Form(True, 0.2), Form(False, 0.05))
 _FIRST_FORM = Form(False, 0.2)
+
+#: The most cells of all tiles of one map: 32 MiB of counters, and as much for each of two tables.
+_MOST_CELLS = 1 << 23
 
 #: Maps are given up if they do not pay after this number of samples per pixel, in this number of
 #: stages.
@@ -214,7 +217,10 @@ class MapLearner(Learner):
         """The tiles that have maps once each pixel has this number of samples."""
         cells = self.maps * self.cells.count
         edge = max(self._least_edge, tile_edge(samples, cells, _EARLY_PART))
-        return FilmTiles.of_cells(*self._extent, edge, cells)
+        tiles = FilmTiles(*self._extent, edge)
+        while tiles.count * cells > _MOST_CELLS:
+            tiles = FilmTiles(*self._extent, 2 * tiles.edge)
+        return tiles
 
     def _candidate(self, shares: Shares, form: Form, tiles: FilmTiles) -> Candidate:
         """A density to be tried in the next stage. It is called with tables of ``tiles``, which may

@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...images.box_filter import RADIUS, box_means
+from ...rendering.film_tiles import FilmTiles
 from ...util.arrays import from_numpy
-from .film_tiles import FilmTiles
 
 #: Fixed point of counts and of their squares, of radiance, and of squared radiance.
 _ONE, _ONE_X, _ONE_X2 = 2.0**12, 2.0**16, 2.0**12

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...rendering.film_tiles import FilmTiles
 from ...transport.observer import Observer
 from ...util.arrays import from_numpy
 from ...util.discrete_sampling import ONE_MINUS_EPSILON
@@ -61,21 +62,12 @@ class VisibilityCounts(Observer):
     """
 
     def __init__(self, width: int, height: int, columns: int, rows: int) -> None:
-        self.edge = _TILE
-        while -(-width // self.edge) * -(-height // self.edge) > _MOST_TILES:
-            self.edge += 1
-        self.across, self.down = -(-width // self.edge), -(-height // self.edge)
+        self.tiles = FilmTiles(width, height, _TILE)
+        while self.tiles.count > _MOST_TILES:
+            self.tiles = FilmTiles(width, height, self.tiles.edge + 1)
         self.columns, self.rows = columns, rows
-        self._width, self._across, self._edge = (
-            dr.opaque(mi.UInt32, n) for n in (width, self.across, self.edge)
-        )
         # Tests in the low half, successes in the high one: one addition counts both
-        self._counts = dr.zeros(mi.UInt64, self.across * self.down * columns * rows)
-
-    def tile(self, pixel: mi.UInt32) -> mi.UInt32:
-        """The number of a pixel's tile."""
-        y = pixel // self._width
-        return y // self._edge * self._across + (pixel - y * self._width) // self._edge
+        self._counts = dr.zeros(mi.UInt64, self.tiles.count * columns * rows)
 
     def cell(self, tile: mi.UInt32, point: mi.Point2f) -> mi.UInt32:
         """The cell of a point of the unit square."""
@@ -114,7 +106,7 @@ class VisibilityCounts(Observer):
 
     def visibility(self) -> np.ndarray:
         """The probability that a shadow ray arrives, never 0; shape [tiles, rows, columns]."""
-        counts = self.counts.reshape(self.down, self.across, self.rows, self.columns)
+        counts = self.counts.reshape(self.tiles.rows, self.tiles.columns, self.rows, self.columns)
         tests, seen = (counts & 0xFFFFFFFF).astype(np.float64), (counts >> 32).astype(np.float64)
         near_tests, near_seen = _with_neighbours(tests), _with_neighbours(seen)
         # Half a success in one more test keeps the prior from being 0
@@ -128,9 +120,11 @@ class VisibilityCounts(Observer):
 
     def __str__(self) -> str:
         tests, seen = (int(n.sum()) for n in (self.counts & 0xFFFFFFFF, self.counts >> 32))
+        tiles = self.tiles
         return (
-            f"visibility: {self.across} x {self.down} tiles of {self.edge} pixels, {self.columns} "
-            f"x {self.rows} cells, {seen / max(tests, 1):.1%} of {tests} shadow rays arrived"
+            f"visibility: {tiles.columns} x {tiles.rows} tiles of {tiles.edge} pixels, "
+            f"{self.columns} x {self.rows} cells, {seen / max(tests, 1):.1%} of {tests} shadow "
+            f"rays arrived"
         )
 
 

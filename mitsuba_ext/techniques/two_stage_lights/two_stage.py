@@ -97,7 +97,7 @@ class TwoStage(EmitterSampling):
 
     def begin(self, sampler, ray, pixel=None) -> State:
         has_maps = self._counts is not None and pixel is not None
-        tile = self._counts.tile(pixel) if has_maps else mi.UInt32(0)
+        tile = self._counts.tiles.tile(pixel) if has_maps else mi.UInt32(0)
         return State(mi.Float(0), mi.Bool(False), mi.Bool(True), tile)
 
     def visit(self, state, scene, si, active) -> Place:

@@ -9,9 +9,9 @@ import pytest
 
 from mitsuba_ext.planning.pilots import doubling_pilots, stage_weights
 from mitsuba_ext.rendering.dither import dithered_parts
+from mitsuba_ext.rendering.film_tiles import FilmTiles
 from mitsuba_ext.techniques.swarming.cells import CellDensities, Cells
 from mitsuba_ext.techniques.swarming.estimate import Form, Grid, Shares, estimate
-from mitsuba_ext.techniques.swarming.film_tiles import FilmTiles
 from mitsuba_ext.techniques.swarming.tile_counts import Choices, TileCounts
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -59,11 +59,11 @@ KINDS = ("random", "untrained", "one cell", "nothing visible")
 
 def test_pixels_lie_in_tiles_and_a_large_film_has_larger_ones() -> None:
     counts = VisibilityCounts(WIDTH, HEIGHT, 16, 16)
-    tiles = counts.tile(dr.arange(mi.UInt32, WIDTH * HEIGHT)).numpy().reshape(HEIGHT, WIDTH)
-    assert (counts.across, counts.down) == (3, 2)
+    tiles = counts.tiles.tile(dr.arange(mi.UInt32, WIDTH * HEIGHT)).numpy().reshape(HEIGHT, WIDTH)
+    assert (counts.tiles.columns, counts.tiles.rows) == (3, 2)
     assert tiles[0, 7] == 0 and tiles[0, 8] == 1 and tiles[8, 0] == 3 and tiles.max() == 5
     large = VisibilityCounts(3840, 2160, 16, 16)
-    assert large.across * large.down <= 8192 and large.edge > 8
+    assert large.tiles.count <= 8192 and large.tiles.edge > 8
 
 
 def test_visibility_is_a_probability_and_follows_the_counts() -> None:

@@ -1,12 +1,9 @@
-"""Square tiles of the film, whose pixels share their maps."""
+"""Square tiles of the film, whose pixels share what they learn."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-
-#: The most cells of all tiles of one map: 32 MiB of counters, and as much for each of two tables.
-_MOST_CELLS = 1 << 23
 
 
 class FilmTiles:
@@ -29,14 +26,6 @@ class FilmTiles:
         self._width, self._edge, self._across = (
             dr.opaque(mi.UInt32, x) for x in (width, edge, self.columns)
         )
-
-    @classmethod
-    def of_cells(cls, width: int, height: int, edge: int, cells: int) -> FilmTiles:
-        """Tiles of this edge, or larger ones where the film is large and tiles have many cells."""
-        tiles = cls(width, height, edge)
-        while tiles.count * cells > _MOST_CELLS:
-            tiles = cls(width, height, 2 * tiles.edge)
-        return tiles
 
     def tile(self, pixel: mi.UInt32) -> mi.UInt32:
         """The tile of a pixel, both counted row by row."""
