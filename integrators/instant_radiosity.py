@@ -33,7 +33,7 @@ from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_tree import
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_lights import MOST_PATHS, Sets
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
-from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.estimator import Estimator
@@ -203,7 +203,11 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         return max(2, super().sample_cost)
 
     def estimators(self, scene, sensor, learning):
-        self._check(scene)
+        refuse_to_share(
+            scene, self.name,
+            "camera paths of other wavelengths and times cannot share virtual lights; use "
+            '"bdpt" or "path"',
+        )  # fmt: skip
         if not scene.emitters() or self.max_depth < 3:
             return self._walk_alone if self.light_aovs else self.walk
         refuse_clear_curves(scene, f'"{self.name}"')
@@ -219,18 +223,6 @@ class InstantRadiosityIntegrator(WalkIntegrator):
 
     def _walk_alone(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
         return AllDirect(self.walk(decisions, observer))
-
-    def _check(self, scene: mi.Scene) -> None:
-        """
-        Raises:
-            NotImplementedError: Virtual lights cannot be shared by all camera paths in this scene.
-        """
-        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
-        if mi.is_spectral or movers(scene):
-            raise NotImplementedError(
-                f'"{self.name}": {reason}: camera paths of other wavelengths and times cannot '
-                f'share virtual lights; use "bdpt" or "path"'
-            )
 
     def _estimator(
         self,

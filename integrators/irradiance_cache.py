@@ -19,7 +19,7 @@ from mitsuba_ext.estimators.caches.record_grid import RecordGrid
 from mitsuba_ext.estimators.caches.records import Records
 from mitsuba_ext.planning.learned_file import LearnedFile
 from mitsuba_ext.rendering.camera import film_extent
-from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.emission import can_be_hit
@@ -167,12 +167,10 @@ class IrradianceCache(WalkIntegrator):
     # ---- The render ----
 
     def query(self, scene):
-        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
-        if mi.is_spectral or movers(scene):
-            raise NotImplementedError(
-                f'"{self.name}": {reason}: records are shared by all wavelengths and times; use '
-                f'"auto" or "photon_map"'
-            )
+        refuse_to_share(
+            scene, self.name,
+            'records are shared by all wavelengths and times; use "auto" or "photon_map"',
+        )  # fmt: skip
         return super().query(scene)
 
     def schedule(self, scene, sensor, samples, seed, learning):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.estimators.light_paths.light_program import StoredHistory
+from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
 from mitsuba_ext.estimators.light_paths.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
@@ -143,10 +143,7 @@ class LightTracerIntegrator(WalkIntegrator):
         if scene.emitters() and self.max_depth > 1:
             refuse_clear_curves(scene, f'"{self.name}"')
             self._warn_of_hidden(scene)
-            try:
-                emission = LightEmission(scene)
-            except NotImplementedError as error:
-                raise NotImplementedError(f'"{self.name}": {error}') from None
+            emission = light_emission(self.name, scene)
             walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
             target = connectable_sensor(self.name, self.lens_sampling, scene, sensor, query)
         directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)

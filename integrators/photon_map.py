@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
 from mitsuba_ext.estimators.light_paths.photons.gathering_paths import (
@@ -27,7 +27,7 @@ from mitsuba_ext.estimators.light_paths.photons.photon_maps import (
     photon_walk,
 )
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
-from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.observer import Observer
@@ -145,32 +145,20 @@ class PhotonMapping(WalkIntegrator):
 
     def _traced(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> PhotonMaps:
         query = self.query(scene)
-        self._check(scene)
+        refuse_to_share(
+            scene, self.name,
+            'photons of other wavelengths and times cannot be merged; use "sppm" or "vcm"',
+        )  # fmt: skip
         if not scene.emitters() or self.max_depth < 2:
             return PhotonMaps()
         refuse_clear_curves(scene, f'"{self.name}"')
-        try:
-            emission = LightEmission(scene)
-        except NotImplementedError as error:
-            raise NotImplementedError(f'"{self.name}": {error}') from None
+        emission = light_emission(self.name, scene)
         walk = photon_walk(LightWalk(emission, self.max_depth, self.rr_depth, query=query))
         return PhotonMaps.trace(
             scene, walk, self.photons, seed, self.final_gather,
             (self.radii["caustic"], self.radii["global"]), self.lookup_size,
             median_footprint(scene, sensor, query),
         )  # fmt: skip
-
-    def _check(self, scene: mi.Scene) -> None:
-        """
-        Raises:
-            NotImplementedError: Photons cannot be shared by all camera paths in this scene.
-        """
-        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
-        if mi.is_spectral or movers(scene):
-            raise NotImplementedError(
-                f'"{self.name}": {reason}: photons of other wavelengths and times cannot be '
-                f'merged; use "sppm" or "vcm"'
-            )
 
     def estimators(self, scene, sensor, learning):
         return functools.partial(self._estimator, scene)

@@ -200,18 +200,15 @@ def _reference_workers(
     executors: contextlib.ExitStack, workers: int | None, dask: str | None, plugins: tuple[str, ...]
 ) -> ReferenceWorkers | None:
     """The workers that render references; ``executors`` shuts them down."""
-    from ..long_renders.dask_cluster import dask_cluster
     from ..long_renders.divided_references import ReferenceWorkers
-    from ..long_renders.workers import Workers, threads_of_each
+    from ..long_renders.executors import renderers
+    from ..long_renders.workers import threads_of_each
 
-    if dask is not None:
-        executor, _check = executors.enter_context(dask_cluster(dask))
-        return ReferenceWorkers(executor, executor.count(), plugins)
-    if workers is None:
+    if workers is None and dask is None:
         return None
-    executor = Workers(workers)
-    executors.callback(executor.shutdown, cancel_futures=True)
-    return ReferenceWorkers(executor, workers, plugins, threads_of_each(workers))
+    found = executors.enter_context(renderers(workers, dask))
+    threads = threads_of_each(workers) if workers else 0
+    return ReferenceWorkers(found.executor, found.count(), plugins, threads)
 
 
 def _has_trouble(scene: Mapping[str, Any]) -> bool:

@@ -7,19 +7,18 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ..inputs.chosen import LastScene
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
-from ..long_renders.dask_cluster import dask_cluster
+from ..long_renders.executors import renderers
 from ..long_renders.folder import CheckpointFolder
 from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
-from ..long_renders.workers import Workers, threads_of_each
+from ..long_renders.workers import threads_of_each
 from ..rendering import interrupts
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
@@ -160,15 +159,17 @@ class LongJob:
 
             self._render = LongRender(self._renderer, state, progress)
             goal = Goal(spp, options.until, seconds)
-            is_reached = False
+            is_reached, workers = False, renderers(options.workers, options.dask or None)
             try:
-                with deferred_interrupt() as interrupt, self._executor() as (executor, n, check):
+                with deferred_interrupt() as interrupt, workers as found:
 
                     def is_stopped() -> bool:
-                        check()
+                        found.check()
                         return interrupt.is_set()
 
-                    is_reached = self._render.run(goal, is_stopped, executor, n)
+                    is_reached = self._render.run(
+                        goal, is_stopped, found.executor, found.count
+                    )
                 if not state.done:  # stopped before any worker finished a batch
                     raise KeyboardInterrupt
             except InputError as error:  # the scheduler or too many workers were lost
@@ -201,24 +202,6 @@ class LongJob:
                 f"{folder}: already holds {kept} samples per pixel, and the image shows all of "
                 f"them, not {spp}"
             )
-
-    @contextlib.contextmanager
-    def _executor(
-        self,
-    ) -> Iterator[tuple[Executor | None, Callable[[], int], Callable[[], None]]]:
-        """The executor that renders, a function for the current number of its workers, and a
-        function that raises an error if they were lost."""
-        if self._options.dask:
-            with dask_cluster(self._options.dask) as (executor, check):
-                yield executor, executor.count, check
-        elif self._options.workers:
-            executor = Workers(self._options.workers)
-            try:
-                yield executor, lambda: self._options.workers, lambda: None
-            finally:
-                executor.shutdown(cancel_futures=True)
-        else:
-            yield None, lambda: 1, lambda: None
 
     # ---- The state of the render ----
 

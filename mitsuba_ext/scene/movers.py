@@ -70,6 +70,20 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
         )
 
 
+def refuse_to_share(scene: mi.Scene, plugin: str, why: str) -> None:
+    """Raises an error where paths have wavelengths or times of their own.
+
+    Parameters:
+        why: What the plugin cannot share between such paths, and which plugins to use instead.
+
+    Raises:
+        NotImplementedError: The variant is spectral, or something moves in ``scene``.
+    """
+    reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+    if mi.is_spectral or movers(scene):
+        raise NotImplementedError(f'"{plugin}": {reason}: {why}')
+
+
 def refuse_moving_lights(scene: mi.Scene) -> None:
     """Raises an error if a light moves; for methods that start paths from lights.
 

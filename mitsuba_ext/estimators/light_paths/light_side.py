@@ -14,6 +14,18 @@ from .emission import LightEmission
 from .sensor import ConnectableSensor
 
 
+def light_emission(plugin: str, scene: mi.Scene) -> LightEmission:
+    """What emits light paths.
+
+    Raises:
+        NotImplementedError: A light cannot emit light paths; the message names the plugin.
+    """
+    try:
+        return LightEmission(scene)
+    except NotImplementedError as error:
+        raise NotImplementedError(f'"{plugin}": {error}') from None
+
+
 @dataclass
 class LightSide:
     """What bidirectional methods need at the light's end of paths.
@@ -44,10 +56,7 @@ class LightSide:
         Raises:
             NotImplementedError: A light cannot emit light paths.
         """
-        try:
-            emission = LightEmission(scene)
-        except NotImplementedError as error:
-            raise NotImplementedError(f'"{plugin}": {error}') from None
+        emission = light_emission(plugin, scene)
         target = ConnectableSensor(sensor) if has_image and _can_connect(sensor) else None
         correct = sampling_weights(scene) if emission.has_smooth_meshes else None
         return cls(emission, target, correct)

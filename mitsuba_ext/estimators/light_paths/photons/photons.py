@@ -10,8 +10,8 @@ from ....scene.bsdfs import refuse_clear_curves
 from ....scene.media import may_have_media
 from ....transport.path_decisions import NoConnections, SceneQuery
 from ....transport.walk import Walk
-from ..emission import LightEmission
 from ..light_media import outer_medium
+from ..light_side import light_emission
 from ..light_walk import LightWalk
 from ..merging.merging_parameters import MergingParameters
 from .photon_mapper import PhotonMapper
@@ -49,10 +49,7 @@ def photon_mapper(
     """
     query = integrator.query(scene)
     refuse_clear_curves(scene, f'"{integrator.name}"')
-    try:
-        emission = LightEmission(scene)
-    except NotImplementedError as error:
-        raise NotImplementedError(f'"{integrator.name}": {error}') from None
+    emission = light_emission(integrator.name, scene)
     outside = outer_medium(query, scene, sensor) if may_have_media(scene) else None
     light_walk = LightWalk(
         emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
