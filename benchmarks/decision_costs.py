@@ -19,6 +19,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 import mitsuba as mi  # isort: skip
 
 from mitsuba_ext.planning import verdicts  # isort: skip
+from mitsuba_ext.rendering.request import Request  # isort: skip
 
 #: Both learned decisions are kept, whatever they are worth.
 _GUIDED = {"type": "guided_directions", "always_guide": True}
@@ -58,7 +59,8 @@ def main(files: tuple[Path, ...], spp: int, rounds: int) -> None:
             for label, integrator in made.items():
                 mi.render(scene, integrator=integrator, seed=seed, spp=spp)
                 told = integrator.statistics
-                samples = spp - sum(integrator.plan_learning(scene, scene.sensors()[0], spp).pilots)
+                request = Request(scene, scene.sensors()[0])
+                samples = spp - sum(integrator.plan_learning(request, spp).pilots)
                 times[label].append((told.seconds - told.learning_seconds) / samples)
         medians = {label: statistics.median(some[1:]) for label, some in times.items()}
         rays = {label: _rays(integrator) for label, integrator in made.items()}

@@ -13,8 +13,8 @@ import mitsuba as mi
 from mitsuba_ext.bases.staged_integrator import NO_LIMIT
 from mitsuba_ext.bases.wrapping_integrator import WrappingIntegrator
 from mitsuba_ext.planning.technique import ParameterReader, Setting
-from mitsuba_ext.rendering.plan import Learning
-from mitsuba_ext.rendering.stages import ChangedSchedule, Schedule, Stage
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import ChangedSchedule, Learning, Schedule, Stage
 from mitsuba_ext.startup.registry import variant_bound
 from mitsuba_ext.techniques.weighted_points.camera_numbers import (
     PURPOSES,
@@ -78,20 +78,19 @@ class ReweightedCamera(WrappingIntegrator):
     # ---- What the base class calls ----
 
     def samples_per_set(self, spp: int) -> int:
-        return samples_per_set(spp, self.timeout > 0)
+        return samples_per_set(spp, is_timed=True)
 
     @property
     def needs_equal_samples(self) -> str:
         return "its sets of numbers belong together"
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
-        learning: Learning,
-    ) -> Schedule:  # fmt: skip
-        schedule = super().schedule(scene, sensor, samples, seed, learning)
+        self, request: Request, samples: tuple[int, ...], learning: Learning
+    ) -> Schedule:
+        schedule = super().schedule(request, samples, learning)
         setting = Setting(
-            scene, sensor, seed, NO_LIMIT, NO_LIMIT, sum(samples), is_timed=self.timeout > 0,
-            plugin=self.name, slot=self.purpose,
+            request.scene, request.sensor, request.seed, NO_LIMIT, NO_LIMIT, sum(samples),
+            is_timed=request.is_timed, plugin=self.name, slot=self.purpose,
         )  # fmt: skip
         numbers = self.numbers.decision(setting)
         return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule

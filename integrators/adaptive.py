@@ -140,8 +140,8 @@ class AdaptiveSampling(WrappingIntegrator):
     def needs_equal_samples(self) -> str:
         return "they are distributed already"
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        return render(self, scene, sensor, seed, spp, develop, evaluate, AdaptiveJob)
+    def render_once(self, request):
+        return render(self, request, AdaptiveJob)
 
     def aov_names(self) -> list[str]:
         return [*self.nested.aov_names(), *([_COUNTS] if self.counts_samples else [])]

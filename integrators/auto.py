@@ -164,11 +164,12 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def plan_learning(self, scene, sensor, spp, kernels=math.inf):
-        pixel_count = math.prod(film_extent(sensor.film()))
+    def plan_learning(self, request, spp, kernels=math.inf):
+        scene, film = request.scene, request.sensor.film()
+        pixel_count = math.prod(film_extent(film))
         is_short = pixel_count * spp < verdicts.LEAST_SAMPLES
-        is_short &= not (self.save_learned or self.keep_learned)
-        plan = super().plan_learning(scene, sensor, 0 if is_short else spp, kernels)
+        is_short &= not (self.target_of(request) or self.keep_learned)
+        plan = super().plan_learning(request, 0 if is_short else spp, kernels)
         if is_short and plan.restore is None:
             remark = f"nothing: with fewer than {verdicts.LEAST_SAMPLES} samples, it is path"
             plan = replace(plan, remark=remark)
@@ -177,18 +178,18 @@ class Auto(LightPathIntegrator):
         tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
         if not (tries or plan.restore) or pixel_count > _MOST_PIXELS or not self._can_try(scene):
             return plan
-        trial = functools.partial(kind.in_own_stage, sensor.film())
+        trial = functools.partial(kind.in_own_stage, film)
         return replace(plan, tries=tries, trial=trial)
 
-    def estimators(self, scene, sensor, learning):
+    def estimators(self, request, spp, learning):
         if learning.trial is None:
             return self.walk
-        if may_have_media(scene):
+        if may_have_media(request.scene):
             mapper = functools.cache(
-                functools.partial(photon_mapper, self, scene, sensor, self.merging)
+                functools.partial(photon_mapper, self, request, self.merging)
             )
             return functools.partial(self._in_media, mapper)
-        return super().estimators(scene, sensor, learning)
+        return super().estimators(request, spp, learning)
 
     def _in_media(
         self,
@@ -204,8 +205,8 @@ class Auto(LightPathIntegrator):
         learns_from = f"{verdicts.LEAST_SAMPLES} samples (with fewer, it is path)"
         return {**super().parameters(), "learns_from": learns_from}
 
-    def merging_radius(self, scene, sensor, side, *sums):
-        return super().merging_radius(scene, sensor, side, *sums) if _can_merge(scene) else None
+    def merging_radius(self, request, side, *sums):
+        return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Whether light paths can be tried in the scene."""

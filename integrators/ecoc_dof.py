@@ -131,6 +131,8 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             }
     """
 
+    missing_in_samples = "a filter makes its picture; nest the other integrator in it"
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.aperture_radius, self.focus_distance = (
@@ -144,7 +146,6 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         self.denoise = self.parameter(props, "denoise", False)
         if self.denoise:
             denoiser()
-        self._is_rendering = False
         self.refuse_equal_samples("the layers of {nested} cannot be rendered one by one")
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
@@ -154,20 +155,11 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     def needs_equal_samples(self) -> str:
         return "a filter makes its picture"
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self._is_rendering = True
-        try:
-            return render(self, scene, sensor, seed, spp, develop, evaluate, LayeredJob)
-        finally:
-            self._is_rendering = False
+    def render_once(self, request):
+        return render(self, request, LayeredJob)
 
-    def schedule(self, scene, sensor, samples, seed, learning) -> Schedule:
-        if not self._is_rendering:
-            raise NotImplementedError(
-                f'"{self.name}": a filter makes its picture: nest the other integrator in it, and '
-                f"not the other way round"
-            )
-        return _FromTheMiddle(super().schedule(scene, sensor, samples, seed, learning))
+    def schedule(self, request, samples, learning) -> Schedule:
+        return _FromTheMiddle(super().schedule(request, samples, learning))
 
     # ---- What the job asks for ----
 

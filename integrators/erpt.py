@@ -21,6 +21,7 @@ from mitsuba_ext.estimators.chains.redistribution import (
 )  # fmt: skip
 from mitsuba_ext.estimators.chains.small_steps import SmallSteps
 from mitsuba_ext.estimators.chains.target import ImageTarget
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.startup import registry
 
 #: The parameters that only chains of primary samples have.
@@ -175,10 +176,10 @@ class EnergyRedistribution(MetropolisIntegrator):
                     f'not be given where "mutations" is "path"'
                 )
 
-    def schedule(self, scene, sensor, samples, seed, learning):
+    def schedule(self, request, samples, learning):
         if not self.has_paths or self.max_depth <= MOST:
-            return super().schedule(scene, sensor, samples, seed, learning)
-        return camera_samples(self, self.setting(scene, sensor, samples, seed))
+            return super().schedule(request, samples, learning)
+        return camera_samples(self, self.setting(request, sum(samples)))
 
     def target(self, setting):
         if self.has_paths:
@@ -186,13 +187,13 @@ class EnergyRedistribution(MetropolisIntegrator):
         return super().target(setting)
 
     def chain_render(
-        self, target: ImageTarget | PathTarget, seed: int, *render: Any
+        self, target: ImageTarget | PathTarget, request: Request, *render: Any
     ) -> RedistributionRender:
         settings = RedistributionSettings(
             self.chain_length, self.mutations_per_pixel, self.outliers, self.luminance_samples,
-            self.steps, self.filters, self.state_file(target, seed),
+            self.steps, self.filters, self.state_file(target, request.seed),
         )  # fmt: skip
-        return RedistributionRender(settings, self, target, seed, *render)
+        return RedistributionRender(settings, self, target, request, *render)
 
     def parameters(self) -> dict[str, Any]:
         shown = super().parameters()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import replace
 
 import mitsuba as mi
@@ -31,7 +30,11 @@ from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_parts impor
 )
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_tree import ClusteredChoice
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_lights import MOST_PATHS, Sets
+from mitsuba_ext.planning.planner import Estimators
 from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import ReportedSchedule
+from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
@@ -196,13 +199,23 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         if self.choice == "learned":
             slots["subpath_selection"] = LearnedSubpaths()
         self.fill(props, **slots)
-        self._tally, self._largest = Tally(), math.inf
 
     @property
     def sample_cost(self) -> int:
         return max(2, super().sample_cost)
 
-    def estimators(self, scene, sensor, learning):
+    def schedule(self, request, samples, learning):
+        # What connections count, until the render reports it
+        tally = Tally()
+        estimators = self._counted_estimators(request, tally)
+        planner = self.planner(request, samples, learning, estimators)
+        return ReportedSchedule(planner, functools.partial(self._report, tally, request.scene))
+
+    def _largest(self, scene: mi.Scene) -> float:
+        return self.bound / scene_diagonal(scene) ** 2
+
+    def _counted_estimators(self, request: Request, tally: Tally) -> Estimators:
+        scene, film = request.scene, request.sensor.film()
         refuse_to_share(
             scene, self.name,
             "camera paths of other wavelengths and times cannot share virtual lights; use "
@@ -211,15 +224,14 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         if not scene.emitters() or self.max_depth < 3:
             return self._walk_alone if self.light_aovs else self.walk
         refuse_clear_curves(scene, f'"{self.name}"')
-        side = LightSide.of(self.name, scene, sensor, has_image=self.light_aovs)
-        self._largest = self.bound / scene_diagonal(scene) ** 2
-        width, height = film_extent(sensor.film())
+        side = LightSide.of(self.name, scene, request.sensor, has_image=self.light_aovs)
+        width, height = film_extent(film)
         sets = Sets(width * height, width, self.light_paths, self.interleaving)
         picture = None
         if self.light_aovs:
-            offset = sensor.film().crop_offset()
-            picture = PictureOfLights(side.sensor, width * height, width, offset)
-        return functools.partial(self._estimator, side, sets, picture)
+            picture = PictureOfLights(side.sensor, width * height, width, film.crop_offset())
+        largest = self._largest(scene)
+        return functools.partial(self._estimator, side, sets, picture, largest, tally)
 
     def _walk_alone(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
         return AllDirect(self.walk(decisions, observer))
@@ -229,6 +241,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         side: LightSide,
         sets: Sets,
         picture: PictureOfLights | None,
+        largest: float,
+        tally: Tally,
         decisions: Decisions,
         observer: Observer | None = None,
     ) -> Estimator:
@@ -240,8 +254,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         )
         chosen = {} if selection is None else {"selection": selection}
         return InstantRadiosity(
-            walk, light_walk, sets, Bound(self._largest, self.compensation), self.connections,
-            _CHOICES[self.choice] or UniformChoice, tally=self._tally, picture=picture, **chosen,
+            walk, light_walk, sets, Bound(largest, self.compensation), self.connections,
+            _CHOICES[self.choice] or UniformChoice, tally=tally, picture=picture, **chosen,
         )  # fmt: skip
 
     def aov_names(self) -> list[str]:
@@ -249,12 +263,10 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         own = [f"{layer}.{c}" for layer in (*PARTS, LIGHTS) for c in channels]
         return (own if self.light_aovs else []) + super().aov_names()
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self._tally, self._largest = Tally(), math.inf
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
-        if self._tally.sets:
-            lights = self._tally.lights / self._tally.sets
-            what = f"{lights:.0f} virtual lights in a set, {self._tally.sets} sets, connections "
-            what += f"bounded by {self._largest:.3g} / length²"
-            self.statistics.learned = "; ".join(filter(None, (self.statistics.learned, what)))
-        return image
+    def _report(self, tally: Tally, scene: mi.Scene, statistics: RenderStatistics) -> None:
+        if tally.sets:
+            lights = tally.lights / tally.sets
+            statistics.add_learned(
+                f"{lights:.0f} virtual lights in a set, {tally.sets} sets, connections bounded by "
+                f"{self._largest(scene):.3g} / length²"
+            )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import mitsuba as mi
@@ -19,6 +20,9 @@ from mitsuba_ext.estimators.caches.record_grid import RecordGrid
 from mitsuba_ext.estimators.caches.records import Records
 from mitsuba_ext.planning.learned_file import LearnedFile
 from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import ReportedSchedule
+from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.decisions import Decisions
@@ -173,29 +177,30 @@ class IrradianceCache(WalkIntegrator):
         )  # fmt: skip
         return super().query(scene)
 
-    def schedule(self, scene, sensor, samples, seed, learning):
-        width, height = film_extent(sensor.film())
-        self._begin, self._seed = time.perf_counter(), seed
-        self._samples = sum(samples) * width * height
+    def schedule(self, request, samples, learning):
         self.records, self.rounds = Records.none(len(mi.Spectrum())), []
-        return super().schedule(scene, sensor, samples, seed, learning)
+        return ReportedSchedule(super().schedule(request, samples, learning), self._report)
 
-    def estimators(self, scene, sensor, learning):
-        return functools.partial(self._estimator, scene, sensor)
+    def estimators(self, request, spp, learning):
+        has_time = deadline(0.5 * request.timeout, time.perf_counter())
+        return functools.partial(self._estimator, request, spp, has_time)
 
     def _estimator(
-        self, scene: mi.Scene, sensor: mi.Sensor, decisions: Decisions,
+        self, request: Request, spp: int, has_time: Callable[[], bool], decisions: Decisions,
         observer: Observer | None = None,
     ) -> Walk:  # fmt: skip
-        walk = self.walk(decisions, observer)
+        scene, walk = request.scene, self.walk(decisions, observer)
         # Pilots teach decisions that the paths of records then use
         if observer is not None or self.max_depth < 3 or not scene.emitters():
             return walk
-        grid = self._cached(scene, sensor, walk)
+        grid = self._cached(request, spp, has_time, walk)
         return replace(walk, program=CachedLight(grid, self.max_depth, can_be_hit(scene)))
 
-    def _cached(self, scene: mi.Scene, sensor: mi.Sensor, walk: Walk) -> RecordGrid:
-        """Makes the records that the view needs."""
+    def _cached(
+        self, request: Request, spp: int, has_time: Callable[[], bool], walk: Walk
+    ) -> RecordGrid:
+        """Makes the records that the view needs, for a render of ``spp`` samples per pixel."""
+        scene, sensor, seed = request.scene, request.sensor, request.seed
         parameters = CacheParameters(self.accuracy, self.min_spacing, self.max_spacing)
         depth = self.max_depth if self.max_depth == NO_LIMIT else self.max_depth - 1
         inner = replace(
@@ -203,14 +208,14 @@ class IrradianceCache(WalkIntegrator):
         )
         strata = Strata.about(self.gather_samples)
         gatherer = Gatherer(
-            scene, inner, strata, parameters.bounds,
-            self.min_spacing, self.max_share, self._seed,
-        )  # fmt: skip
+            scene, inner, strata, parameters.bounds, self.min_spacing, self.max_share, seed
+        )
         file = self._file(scene)
         known = self._known(file)
-        most = int(self.effort * self._samples / strata.count)
-        rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, self._seed, known, most)
-        rounds.run(deadline(0.5 * self.timeout, self._begin))
+        width, height = film_extent(sensor.film())
+        most = int(self.effort * (spp * width * height) / strata.count)
+        rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, seed, known, most)
+        rounds.run(has_time)
         self.records, self.rounds = rounds.records, rounds.rounds
         if file is not None and len(self.records) > len(known):
             file.save({"records": self.records.arrays()})
@@ -230,18 +235,14 @@ class IrradianceCache(WalkIntegrator):
             return Records.none(channels)
         return Records.of_arrays(stored.part("records/"), channels)
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+    def _report(self, statistics: RenderStatistics) -> None:
         if self.rounds:
             made, last = sum(r.made for r in self.rounds), self.rounds[-1]
-            told = (
+            statistics.add_learned(
                 f"{len(self.records)} records of irradiance ({made} new), "
                 f"{last.uncovered / max(1, last.asked):.2%} of the places uncovered before the "
                 f"last round; the image is biased"
             )
-            learned = self.statistics.learned
-            self.statistics.learned = f"{learned}; {told}" if learned else told
-        return image
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         raise NotImplementedError(

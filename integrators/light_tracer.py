@@ -127,7 +127,8 @@ class LightTracerIntegrator(WalkIntegrator):
     def needs_equal_samples(self) -> str:
         return "its light paths find light for all pixels"
 
-    def schedule(self, scene, sensor, samples, seed, learning) -> OneStage:
+    def schedule(self, request, samples, learning) -> OneStage:
+        scene, sensor = request.scene, request.sensor
         if not ConnectableSensor.can_connect(sensor):
             raise NotImplementedError(
                 f'"{self.name}": nothing can be connected to the sensor '

@@ -16,6 +16,7 @@ from mitsuba_ext.bases.path_mutations import (
 )
 from mitsuba_ext.estimators.chains.path_target import PathTarget
 from mitsuba_ext.estimators.chains.visits import MetropolisRender
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.startup import registry
 
 
@@ -102,13 +103,13 @@ class PathMetropolis(ChainIntegrator):
         self.long_chains = LongChains.read(self, props, p_large=0.2)
         self.switches = read_switches(self, props)
 
-    def schedule(self, scene, sensor, samples, seed, learning):
+    def schedule(self, request, samples, learning):
         if self.max_depth <= MOST:
-            return super().schedule(scene, sensor, samples, seed, learning)
-        return camera_samples(self, self.setting(scene, sensor, samples, seed))
+            return super().schedule(request, samples, learning)
+        return camera_samples(self, self.setting(request, sum(samples)))
 
     def target(self, setting):
         return path_target(self, setting, self.switches)
 
-    def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
-        return self.long_chains.render(self, target, seed, *render)
+    def chain_render(self, target: PathTarget, request: Request, *render: Any) -> MetropolisRender:
+        return self.long_chains.render(self, target, request, *render)

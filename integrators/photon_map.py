@@ -139,10 +139,6 @@ class PhotonMapping(WalkIntegrator):
         slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
         self.fill(props, **slots)
 
-    def schedule(self, scene, sensor, samples, seed, learning):
-        self.maps = self._traced(scene, sensor, seed)
-        return super().schedule(scene, sensor, samples, seed, learning)
-
     def _traced(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> PhotonMaps:
         query = self.query(scene)
         refuse_to_share(
@@ -160,17 +156,19 @@ class PhotonMapping(WalkIntegrator):
             median_footprint(scene, sensor, query),
         )  # fmt: skip
 
-    def estimators(self, scene, sensor, learning):
-        return functools.partial(self._estimator, scene)
+    def estimators(self, request, spp, learning):
+        self.maps = self._traced(request.scene, request.sensor, request.seed)
+        return functools.partial(self._estimator, request.scene, self.maps)
 
     def _estimator(
-        self, scene: mi.Scene, decisions: Decisions, observer: Observer | None = None
-    ) -> Walk:
+        self, scene: mi.Scene, maps: PhotonMaps, decisions: Decisions,
+        observer: Observer | None = None,
+    ) -> Walk:  # fmt: skip
         # Without a final gather, one more segment finds direct light
         last = ENDED if self.final_gather else GATHERS_ON
-        if self.guided and self.maps.gathered is not None:
-            decisions = replace(decisions, scattering=PhotonDirections(self.maps))
-        photons = PhotonSubpaths(*self.maps.estimates(scene, self.max_depth), self.final_gather)
+        if self.guided and maps.gathered is not None:
+            decisions = replace(decisions, scattering=PhotonDirections(maps))
+        photons = PhotonSubpaths(*maps.estimates(scene, self.max_depth), self.final_gather)
         program = GatheringPaths(photons, last)
         return replace(self.walk(decisions, observer), program=program)
 

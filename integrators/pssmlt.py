@@ -10,6 +10,7 @@ from mitsuba_ext.bases.long_chains import LongChains
 from mitsuba_ext.bases.metropolis_integrator import MetropolisIntegrator
 from mitsuba_ext.estimators.chains.target import ImageTarget
 from mitsuba_ext.estimators.chains.visits import MetropolisRender
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.startup import registry
 
 
@@ -91,5 +92,5 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
         uses_uniform = self.parameter(props, "kelemen_style_weights", True)
         self.long_chains.uses_uniform = uses_uniform
 
-    def chain_render(self, target: ImageTarget, seed: int, *render: Any) -> MetropolisRender:
-        return self.long_chains.render(self, target, seed, *render)
+    def chain_render(self, target: ImageTarget, request: Request, *render: Any) -> MetropolisRender:
+        return self.long_chains.render(self, target, request, *render)

@@ -132,12 +132,13 @@ class ProgressivePhotonMapping(WalkIntegrator):
     def most_lanes(self) -> int:
         return most_lanes(self.light_paths)
 
-    def schedule(self, scene, sensor, samples, seed, learning) -> OneStage:
+    def schedule(self, request, samples, learning) -> OneStage:
+        scene = request.scene
         if not scene.emitters() or self.max_depth < 2:
             alone = Decisions(next_event=NoConnections(), query=self.query(scene))
             return OneStage(self.walk(alone))
         check_shared_rays(self.name, scene, self.light_paths)
         mapper = photon_mapper(
-            self, scene, sensor, self.merging, self.radius_in_media, self.light_paths
+            self, request, self.merging, self.radius_in_media, self.light_paths
         )
-        return OneStage(mapper, CameraSamples(**shared_numbers(scene, seed)))
+        return OneStage(mapper, CameraSamples(**shared_numbers(scene, request.seed)))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,9 @@ from ..estimators.light_paths.partial_sums import PartialSums
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..images import image_files
 from ..rendering.camera import film_extent
+from ..rendering.request import Request
+from ..rendering.stages import ReportedSchedule
+from ..rendering.statistics import RenderStatistics
 from ..scene.movers import movers
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
@@ -60,7 +63,6 @@ class LightPathIntegrator(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.techniques: TechniqueImages | None = None
-        self._radius: Callable[..., MergingRadius | None] | None = None
 
     @property
     def needs_equal_samples(self) -> str:
@@ -85,21 +87,21 @@ class LightPathIntegrator(WalkIntegrator):
         except NotImplementedError:
             return False
 
-    def estimators(self, scene, sensor, learning):
+    def estimators(self, request, spp, learning):
+        self.techniques = None
+        scene, film = request.scene, request.sensor.film()
         if not scene.emitters() or self.max_depth < 2:
             return self.walk
-        side = LightSide.of(self.name, scene, sensor, self.light_image)
+        side = LightSide.of(self.name, scene, request.sensor, self.light_image)
         check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
-        film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        self._radius = Once(functools.partial(self.merging_radius, scene, sensor, side))
-        return functools.partial(self._estimator, side, self._radius)
+        radius = Once(functools.partial(self.merging_radius, request, side))
+        return LightPathEstimators(self, side, radius, self.techniques)
 
     def merging_radius(
         self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
+        request: Request,
         side: LightSide,
         next_event: EmitterSampling | None = None,
         splits: bool = False,
@@ -115,68 +117,89 @@ class LightPathIntegrator(WalkIntegrator):
         )  # fmt: skip
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth,
-            LightSums(sums, next_event or EmitterSampling()), query=self.query(scene),
+            LightSums(sums, next_event or EmitterSampling()), query=self.query(request.scene),
         )
         return self.merging.radius_of(
-            scene, sensor, light_walk, not self.merges_all, self.samples_before
+            request.scene, request.sensor, light_walk, not self.merges_all,
+            request.samples_before,
+        )  # fmt: skip
+
+    def schedule(self, request, samples, learning):
+        estimators = self.estimators(request, sum(samples), learning)
+        planner = self.planner(request, samples, learning, estimators)
+        scene = request.scene
+        if isinstance(estimators, LightPathEstimators) and (mi.is_spectral or movers(scene)):
+            if estimators.radius():
+                planner.decide(**shared_numbers(scene, request.seed))
+        if not self.technique_images:
+            return planner
+        return ReportedSchedule(
+            planner, functools.partial(self._write_techniques, self.techniques)
         )
 
-    def schedule(self, scene, sensor, samples, seed, learning):
-        self._radius = None
-        schedule = super().schedule(scene, sensor, samples, seed, learning)
-        if self._radius is not None and (mi.is_spectral or movers(scene)) and self._radius():
-            schedule.decide(**shared_numbers(scene, seed))
-        return schedule
+    def _write_techniques(
+        self, images: TechniqueImages | None, statistics: RenderStatistics
+    ) -> None:
+        if images is not None:
+            images.write(Path(self.technique_images), statistics.spp)
+            return
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
+            f'paths: "{self.technique_images}" is not written.',
+        )
 
-    def _estimator(
-        self,
-        side: LightSide,
-        radius_of: Callable[..., MergingRadius | None],
-        decisions: Decisions,
-        observer: Observer | None = None,
-    ) -> Estimator:
-        always = LightPathChoice(self.techniques_by_default, self.techniques)
+    def render_once(self, request):
+        if self.technique_images:
+            check = image_files.check_exr_target
+            self.check_target("technique_images", self.technique_images, check)
+        return super().render_once(request)
+
+
+@dataclass(frozen=True)
+class LightPathEstimators:
+    """Makes the estimators of a render with light paths.
+
+    Attributes:
+        integrator: Has the parameters.
+        side: The lights and the sensor.
+        radius: Within what radius vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
+        images: Receives the contributions of all techniques; ``None`` if nothing does.
+    """
+
+    integrator: LightPathIntegrator
+    side: LightSide
+    radius: Callable[..., MergingRadius | None]
+    images: TechniqueImages | None = None
+
+    def __call__(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
+        integrator, side = self.integrator, self.side
+        always = LightPathChoice(integrator.techniques_by_default, self.images)
         choice: LightPathChoice = decisions.light_paths or always
         techniques = choice.techniques
         are_traced = techniques.light_paths > 0
         next_event = decisions.next_event
-        if not self.sample_direct:
+        if not integrator.sample_direct:
             next_event = NoConnections()
         elif are_traced:
             next_event = side.next_event(next_event)
         else:
             next_event = next_event or side.correct
-        walk = self.walk(replace(decisions, next_event=next_event), observer)
+        walk = integrator.walk(replace(decisions, next_event=next_event), observer)
         if not are_traced:
             return walk
         radius = None
         if techniques.merges:
             compares = choice.observer is not None and choice.observer.compares
-            radius = radius_of(walk.next_event, compares)
+            radius = self.radius(walk.next_event, compares)
         if radius is not None and choice.pixel_width > 1:
             radius = radius.of_coarse_film(choice.pixel_width)
         return BidirectionalPathTracer(
-            walk, side.emission, side.sensor, self.connections * techniques.connections,
+            walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
-            merges_all=self.merges_all, light_paths=techniques.light_paths,
+            merges_all=integrator.merges_all, light_paths=techniques.light_paths,
             most_lanes=_most_lanes(techniques.light_paths),
         )  # fmt: skip
-
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self.techniques = None
-        if self.technique_images:
-            check = image_files.check_exr_target
-            self.check_target("technique_images", self.technique_images, check)
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
-        if self.techniques is not None:
-            self.techniques.write(Path(self.technique_images), self.statistics.spp)
-        elif self.technique_images:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
-                f'paths: "{self.technique_images}" is not written.',
-            )
-        return image
 
 
 @variant_bound

@@ -21,7 +21,8 @@ from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt, interrupted
-from ..rendering.stages import OneStage
+from ..rendering.request import Request
+from ..rendering.stages import Learning, OneStage
 from ..scene.fingerprint import sensor_digest
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
@@ -107,10 +108,10 @@ class ChainIntegrator(WalkIntegrator):
         return self.parameter(props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26)
 
     def chain_render(
-        self, target: ImageTarget | PathTarget, seed: int, *render: Any
+        self, target: ImageTarget | PathTarget, request: Request, *render: Any
     ) -> ChainRender:
-        """Makes the render of the chains. ``target``, ``seed`` and ``render`` are the parameters of
-        :class:`ChainRender` after the integrator."""
+        """Makes the render of the chains. The parameters are those of :class:`ChainRender` after
+        the integrator."""
         raise NotImplementedError
 
     def state_file(self, target: ImageTarget | PathTarget, seed: int) -> LearnedFile | None:
@@ -138,23 +139,24 @@ class ChainIntegrator(WalkIntegrator):
 
     @property
     def finds_direct(self) -> bool:
-        """Do camera samples find direct light?"""
+        """Whether camera samples find direct light."""
         return self.direct_samples >= 0
 
-    def schedule(self, scene, sensor, samples, seed, learning) -> OneStage:
+    def schedule(
+        self, request: Request, samples: tuple[int, ...], learning: Learning
+    ) -> OneStage:
         """The stage of the camera samples."""
-        setting = self.setting(scene, sensor, samples, seed)
+        setting = self.setting(request, sum(samples))
         if self.finds_direct:
             return OneStage(self.composed_walk(setting, min(self.max_depth, 2)))
         return OneStage(_OnlyAlpha(self.composed_walk(setting, min(self.max_depth, 1))))
 
-    def setting(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
-    ) -> Setting:
-        """The setting of the camera samples."""
+    def setting(self, request: Request, spp: int) -> Setting:
+        """The setting of ``spp`` samples per pixel."""
         return Setting(
-            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), 0, self.timeout > 0
-        )
+            request.scene, request.sensor, request.seed, self.max_depth, self.rr_depth, spp,
+            is_timed=request.is_timed,
+        )  # fmt: skip
 
     def composed_walk(
         self, setting: Setting, max_depth: int, program: PathProgram | None = None
@@ -164,30 +166,28 @@ class ChainIntegrator(WalkIntegrator):
         walk = self.walk(decisions_of(self.slots, setting, given))
         return replace(walk, max_depth=max_depth, program=program or PathProgram())
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        start = time.perf_counter()
+    def render_once(self, request: Request) -> mi.TensorXf:
+        start, sensor = time.perf_counter(), request.sensor
         try:
             check_takes_splats(sensor.film())
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
-        spp = self._check_spp(spp, sensor)
-        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else int(seed)
+        request = replace(request, spp=self._check_spp(request.spp, sensor))
 
         def attempt() -> bool:
-            return self._render_all(scene, sensor, seed, spp, start)
+            return self._render_all(request, start)
 
-        is_interrupted = with_recordings(scene, sensor, attempt)
+        is_interrupted = with_recordings(request.scene, sensor, attempt)
         self.statistics.seconds = time.perf_counter() - start
-        image = develop_film(sensor.film(), develop, evaluate)
+        image = develop_film(sensor.film(), request.develop, request.evaluate)
         if is_interrupted:
             raise interrupted(self.name)
         return image
 
-    def _render_all(self, scene, sensor, seed: int, spp: int, start: float) -> bool:
+    def _render_all(self, request: Request, start: float) -> bool:
         """Renders the image into the film. Returns True if the render was interrupted."""
-        setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
-        target = self.target(setting)
-        self._render_camera_samples(scene, sensor, seed, spp, target is not None)
+        target = self.target(self.setting(request, request.spp))
+        self._render_camera_samples(request, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
         if target is None and not statistics.learned:
             statistics.learned = (
@@ -196,7 +196,7 @@ class ChainIntegrator(WalkIntegrator):
             )
         if target is None or self.is_cancelled:
             return False
-        chains = self.chain_render(target, seed, spp, camera_spp, statistics, start)
+        chains = self.chain_render(target, request, camera_spp, statistics, start)
         with deferred_interrupt() as interrupt:
             chains.run(interrupt)
         return interrupt.is_set()
@@ -209,20 +209,16 @@ class ChainIntegrator(WalkIntegrator):
             )
         return spp or sample_count(sensor, 0)
 
-    def _render_camera_samples(self, scene, sensor, seed, spp: int, has_chains: bool) -> None:
-        """Renders them into the film, and sets ``self.statistics``; ``spp`` is the number of
-        samples of the whole render, chains included."""
-        report, timeout = self.progress, self.timeout
-        if has_chains:
-            self.progress = None
-            self.timeout = timeout * _CAMERA_SHARE
+    def _render_camera_samples(self, request: Request, has_chains: bool) -> None:
+        """Renders them into the film, and sets ``self.statistics``. ``request`` asks for the whole
+        render, chains included."""
         count = _CAMERA_SAMPLES
         if self.finds_direct:
-            count = self.direct_samples or max(count, int(_DIRECT_SHARE * spp))
-        try:
-            super().render_once(scene, sensor, seed, count, False, False)
-        finally:
-            self.progress, self.timeout = report, timeout
+            count = self.direct_samples or max(count, int(_DIRECT_SHARE * request.spp))
+        request = replace(request, spp=count, develop=False, evaluate=False)
+        if has_chains:
+            request = replace(request, timeout=request.timeout * _CAMERA_SHARE, progress=None)
+        super().render_once(request)
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

@@ -11,6 +11,7 @@ from ..estimators.chains.path_target import PathTarget
 from ..estimators.chains.small_steps import SmallSteps
 from ..estimators.chains.target import ImageTarget
 from ..estimators.chains.visits import ChainSettings, MetropolisRender
+from ..rendering.request import Request
 
 if TYPE_CHECKING:
     from .chain_integrator import ChainIntegrator
@@ -52,13 +53,13 @@ class LongChains:
         self,
         integrator: ChainIntegrator,
         target: ImageTarget | PathTarget,
-        seed: int,
+        request: Request,
         *render: Any,
     ) -> MetropolisRender:
         """Makes the render of the chains. The parameters after the integrator are those of
         :meth:`ChainIntegrator.chain_render`."""
         settings = ChainSettings(
             self.chains, self.luminance_samples, self.p_large, self.steps, self.uses_uniform,
-            self.two_stage, integrator.state_file(target, seed),
+            self.two_stage, integrator.state_file(target, request.seed),
         )  # fmt: skip
-        return MetropolisRender(settings, integrator, target, seed, *render)
+        return MetropolisRender(settings, integrator, target, request, *render)

@@ -5,6 +5,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -12,7 +13,8 @@ import mitsuba as mi
 
 from ..planning.planner import LearningPlan, Planner
 from ..planning.technique import Setting, decisions_of
-from ..rendering.stages import OneStage
+from ..rendering.stages import OneStage, ReportedSchedule
+from ..rendering.statistics import RenderStatistics
 from ..scene.mark import SceneMark
 from ..scene.media import refuse_media
 from ..scene.movers import movers
@@ -67,7 +69,6 @@ class RememberingPath(WalkIntegrator):
         if self.can_learn:
             self.learn_every = self.parameter(props, "learn_every", 16, minimum=0)
         self._remembered: _Remembered | None = None
-        self._schedule: Planner | None = None
         self._renders = 0
 
     def parameters(self) -> dict[str, Any]:
@@ -99,38 +100,43 @@ class RememberingPath(WalkIntegrator):
 
     @property
     def is_due(self) -> bool:
-        """Is what it has learned too old?"""
+        """Whether what it has learned is too old."""
         return 0 < self.learn_every <= self._renders
 
-    def plan_learning(self, scene, sensor, spp, kernels=math.inf):
+    def plan_learning(self, request, spp, kernels=math.inf):
         if self.is_due:
             self.forget()
-        if self._knows(scene):
+        if self._knows(request.scene):
             return LearningPlan()
         # Many renders use what this one learns: pilots have up to three quarters of its samples
-        return super().plan_learning(scene, sensor, 3 * spp, kernels)
+        return super().plan_learning(request, 3 * spp, kernels)
 
-    def pace_stage(self, scene, sensor, spp):
+    def pace_stage(self, request, spp):
         # Its pilots are worth their time in later renders
         return None
 
-    def schedule(self, scene, sensor, samples, seed, learning):
+    def schedule(self, request, samples, learning):
         self._renders += 1
-        if self._knows(scene):
-            return OneStage(self.walk(self._remembered.decisions))
-        self._schedule, self._renders = super().schedule(scene, sensor, samples, seed, learning), 1
-        return self._schedule
+        if self._knows(request.scene):
+            stage = OneStage(self.walk(self._remembered.decisions))
+            return ReportedSchedule(stage, self._report_known)
+        self._renders = 1
+        planner = self.planner(
+            request, samples, learning, self.estimators(request, sum(samples), learning)
+        )
+        return ReportedSchedule(
+            planner, functools.partial(self._remember, request.scene, planner)
+        )
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self._schedule = None
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
-        if self._schedule is not None and not self.statistics.interrupted:
-            said = self.statistics.learned, self.statistics.effects
-            self._remembered = _Remembered(SceneMark(scene), self._schedule.decisions, said)
-        elif self._knows(scene):
-            self.statistics.learned, self.statistics.effects = self._remembered.said
-        self._schedule = None
-        return image
+    def _remember(
+        self, scene: mi.Scene, planner: Planner, statistics: RenderStatistics
+    ) -> None:
+        if not statistics.interrupted:
+            said = statistics.learned, statistics.effects
+            self._remembered = _Remembered(SceneMark(scene), planner.decisions, said)
+
+    def _report_known(self, statistics: RenderStatistics) -> None:
+        statistics.learned, statistics.effects = self._remembered.said
 
     def query(self, scene):
         refuse_media(scene, f'"{self.name}"', 'use "prbvolpath"')

@@ -5,14 +5,14 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..planning.planner import LearningPlan
+from ..planning.planner import Estimators, LearningPlan
+from ..rendering.request import Request
 from ..scene.gradients import Optimized
 from ..scene.mark import SceneMark
 from ..startup.registry import variant_bound
@@ -71,13 +71,15 @@ class SensitivePath(RememberingPath):
         # Pilots are three quarters of the samples
         samples = min(4 * self._pilot_spp // 3 + 1, spp * (self.learn_every or 16) // 4)
         # Other random numbers than those of the pass that uses what is learned
-        seed = mi.UInt32(seed) + 0x9E3779B9
+        seed = int((mi.UInt32(seed) + 0x9E3779B9)[0])
+        request = Request(
+            scene, sensor, seed, max(4, samples), develop=False, timeout=self.timeout,
+            progress=self.progress,
+        )  # fmt: skip
         with dr.suspend_grad():
-            self.render_once(scene, sensor, seed, max(4, samples), False, True)
+            self.render_once(request)
 
-    def estimators(
-        self, scene: mi.Scene, sensor: mi.Sensor, learning: LearningPlan
-    ) -> Callable[[Decisions, Observer | None], Estimator]:
+    def estimators(self, request: Request, spp: int, learning: LearningPlan) -> Estimators:
         def sensitive(decisions: Decisions, observer: Observer | None = None) -> Estimator:
             walk = self.walk(decisions, observer)
             return replace(walk, program=Sensitivity(self._optimized))

@@ -19,8 +19,8 @@ from ..long_renders.intervals import Interval
 from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.interrupts import interrupted
-from ..rendering.plan import Learning
-from ..rendering.stages import Schedule, Stage
+from ..rendering.request import Request
+from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
 from ..startup.registry import variant_bound
@@ -84,9 +84,6 @@ class StagedIntegrator(mi.SamplingIntegrator):
         self.checkpoint = read_parameter(self.name, props, "checkpoint", "")
         if self.checkpoint:
             self.checkpoint_every = self._interval(props)
-        self._is_batch = False
-        #: If a render is one of several batches: samples per pixel of those with smaller numbers.
-        self.samples_before = 0
         self.progress: Callable[[float], None] | None = None
         self.statistics = RenderStatistics()
         self.is_cancelled = False
@@ -94,13 +91,13 @@ class StagedIntegrator(mi.SamplingIntegrator):
     # ---- What a subclass overrides ----
 
     def plan_learning(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+        self, request: Request, spp: int, kernels: float = math.inf
     ) -> Learning:
-        """See :class:`mitsuba_ext.rendering.plan.Planned`."""
+        """See :class:`mitsuba_ext.rendering.staged.Staged`."""
         return Learning()
 
-    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
-        """See :class:`mitsuba_ext.rendering.render.Staged`."""
+    def pace_stage(self, request: Request, spp: int) -> Stage | None:
+        """See :class:`mitsuba_ext.rendering.staged.Staged`."""
         return None
 
     @property
@@ -115,8 +112,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return NO_LIMIT
 
     def samples_per_set(self, spp: int) -> int:
-        """How many of the ``spp`` samples of a pixel form a set. A timeout does not stop within
-        a set."""
+        """How many of the ``spp`` samples of a pixel form a set, in a render with a timeout, which
+        does not stop within a set."""
         return 1
 
     @property
@@ -131,9 +128,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return 0
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
-        learning: Learning,
-    ) -> Schedule:  # fmt: skip
+        self, request: Request, samples: tuple[int, ...], learning: Learning
+    ) -> Schedule:
         """Makes one stage for each entry of ``samples`` (samples per pixel): pilots, and the last
         one."""
         raise NotImplementedError
@@ -156,17 +152,26 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- What Mitsuba calls ----
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, **wishes):
+        """Renders. ``wishes`` are further attributes of
+        :class:`~mitsuba_ext.rendering.request.Request`, such as a ``timeout`` in the place of the
+        parameter of that name."""
         spp = self._checked(scene, spp) or self.default_spp
         sensor = camera.find_sensor(scene, sensor)
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        own = {"timeout": self.timeout, "progress": self.progress}
+        request = Request(
+            scene, sensor, seed & 0xFFFFFFFF, spp, develop, evaluate, **{**own, **wishes}
+        )
+        if request.is_batch:
+            with in_turn(self, sensor):
+                return self.render_once(request)
         with in_turn(self, sensor, self._forget_cancel):
-            if self.checkpoint and not self._is_batch:
-                return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
-            return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+            return self._render_kept(request) if self.checkpoint else self.render_once(request)
 
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+    def render_once(self, request: Request) -> mi.TensorXf:
         """Renders the whole image, or one batch of a checkpointed render."""
-        return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
+        return rendering.render(self, request)
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names; none by default."""
@@ -193,8 +198,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def _forget_cancel(self) -> None:
         """Forgets that an earlier render was cancelled. (Not in turn: whoever cancels a render that
         waits for its turn means this one.)"""
-        if not self._is_batch:
-            self.is_cancelled = False
+        self.is_cancelled = False
 
     def _interval(self, props: mi.Properties) -> Interval:
         text = read_parameter(self.name, props, "checkpoint_every", "60s")
@@ -203,23 +207,18 @@ class StagedIntegrator(mi.SamplingIntegrator):
         except ValueError as error:
             raise ValueError(f'"{self.name}": the parameter "checkpoint_every": {error}') from None
 
-    def _render_kept(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+    def _render_kept(self, request: Request) -> mi.TensorXf:
         # Imported here: the modules of batches are above this one, and import it
         from ..long_renders.kept_render import KeptRender
 
-        begin = time.perf_counter()
-        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        begin, sensor = time.perf_counter(), request.sensor
         shown = {**self.common_parameters(), **self.parameters()}
         shown = {key: value for key, value in shown.items() if key not in _NOT_OF_THE_IMAGE}
         kept = KeptRender(self, Path(self.checkpoint), self.checkpoint_every, str(shown))
-        timeout, progress = self.timeout, self.progress
-        self.timeout, self.progress, self._is_batch = -1.0, None, True
-        try:
-            state, is_interrupted = kept.run(
-                scene, sensor, seed & 0xFFFFFFFF, spp, timeout if timeout > 0 else None, progress
-            )
-        finally:
-            self.timeout, self.progress, self._is_batch = timeout, progress, False
+        state, is_interrupted = kept.run(
+            request.scene, sensor, request.seed, request.spp,
+            request.timeout if request.is_timed else None, request.progress,
+        )  # fmt: skip
         totals = state.totals
         self.statistics = RenderStatistics(
             len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
@@ -228,7 +227,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
             totals.memory_bytes, is_interrupted or self.is_cancelled, totals.tracing_seconds,
             dict(totals.kernels),
         )  # fmt: skip
-        image = camera.develop(sensor.film(), develop, evaluate)
+        image = camera.develop(sensor.film(), request.develop, request.evaluate)
         if is_interrupted:
             raise interrupted(self.name)
         return image

@@ -12,23 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
 from ..planning import kept_learning, learned_file
 from ..planning.costs import LEARNING_KERNELS
 from ..planning.learned_file import LearnedFile
 from ..planning.learner import Learner
 from ..planning.pilots import pilot_samples, stage_weights
-from ..planning.planner import LearningPlan, Planner
+from ..planning.planner import Estimators, LearningPlan, Planner, Saver
 from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
-from ..rendering.stages import Stage
+from ..rendering.request import Request
+from ..rendering.stages import Schedule, Stage
 from ..scene.aovs import check_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
-from ..transport.estimator import CameraRays, Estimator
+from ..transport.estimator import CameraRays
 from ..transport.observer import Observer
 from ..transport.path_decisions import SceneQuery
 from ..transport.queries.aovs import output_variables
@@ -137,10 +137,12 @@ class WalkIntegrator(StagedIntegrator):
                         f'"{self.name}": with "load_learned" nothing is learned: leave "{key}" out'
                     )
 
-    def file_of(self, key: str, scene: mi.Scene, made_by: str) -> LearnedFile | None:
-        """The file that the parameter ``key`` names; ``None`` if the scene names none. ``made_by``
-        is explained in :class:`LearnedFile`."""
-        if not (file := getattr(self, key)):
+    def file_of(
+        self, key: str, scene: mi.Scene, made_by: str, requested: str = ""
+    ) -> LearnedFile | None:
+        """The file that a request names, or else the parameter ``key``; ``None`` if neither does.
+        ``made_by`` is explained in :class:`LearnedFile`."""
+        if not (file := requested or getattr(self, key)):
             return None
         return LearnedFile(Path(file), scene, made_by, f'"{self.name}": the parameter "{key}"')
 
@@ -175,12 +177,13 @@ class WalkIntegrator(StagedIntegrator):
         return bool(self._pilot_spp)
 
     def plan_learning(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+        self, request: Request, spp: int, kernels: float = math.inf
     ) -> LearningPlan:
-        if self.save_learned:
-            self.check_target("save_learned", self.save_learned)
-        if self.load_learned:
-            return LearningPlan(restore=functools.partial(self._loaded, scene, sensor))
+        scene, sensor = request.scene, request.sensor
+        if target := self.target_of(request):
+            self.check_target("save_learned", target)
+        if request.load_learned or self.load_learned:
+            return LearningPlan(restore=functools.partial(self._loaded, request))
         if self.max_depth < 2:
             return LearningPlan()
         pixel_count = math.prod(film_extent(sensor.film()))
@@ -195,15 +198,15 @@ class WalkIntegrator(StagedIntegrator):
         remark = f"nothing: {spp} spp are too few" if is_short else ""
         return LearningPlan(tuple(pilots), remark)
 
-    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+    def pace_stage(self, request: Request, spp: int) -> Stage | None:
         if self.has_light_paths:
             # Camera paths alone would miss the light of some lights, and are much faster
             return None
         # Where maps help much, samples without them are worth less
-        doubles = any(t.doubles and t.can_learn(scene, 1) for t in self.slots.values())
+        doubles = any(t.doubles and t.can_learn(request.scene, 1) for t in self.slots.values())
         weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
-            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(scene)
+            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene)
         )
         return Stage(walk, weight=weight)
 
@@ -212,8 +215,7 @@ class WalkIntegrator(StagedIntegrator):
         return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
 
     def samples_per_set(self, spp: int) -> int:
-        is_timed = self.timeout > 0
-        return max((t.samples_per_set(spp, is_timed) for t in self.slots.values()), default=1)
+        return max((t.samples_per_set(spp) for t in self.slots.values()), default=1)
 
     @property
     def needs_equal_samples(self) -> str:
@@ -223,23 +225,35 @@ class WalkIntegrator(StagedIntegrator):
         return ""
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
-        learning: LearningPlan,
+        self, request: Request, samples: tuple[int, ...], learning: LearningPlan
+    ) -> Schedule:
+        return self.planner(
+            request, samples, learning, self.estimators(request, sum(samples), learning)
+        )
+
+    def planner(
+        self, request: Request, samples: tuple[int, ...], learning: LearningPlan,
+        estimators: Estimators,
     ) -> Planner:  # fmt: skip
+        """The planner of a render. ``estimators`` makes the estimators of stages."""
         *pilots, _rest = samples
         # A restored state needs no pilots, but learners to restore it: these need a pilot_spp > 0
         pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 1
         setting = Setting(
-            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
-            self.timeout > 0, self.name, techniques=self.slots,
+            request.scene, request.sensor, request.seed, self.max_depth, self.rr_depth,
+            sum(samples), pilot_spp, request.is_timed, self.name, techniques=self.slots,
         )  # fmt: skip
         planner = Planner(
-            self.slots, setting, samples, self.estimators(scene, sensor, learning),
-            Decisions(query=self.query(scene)), learning,
-            self._savers(scene, sensor, sum(pilots)),
+            self.slots, setting, samples, estimators,
+            Decisions(query=self.query(request.scene)), learning,
+            self._savers(request, sum(pilots)),
         )  # fmt: skip
         self.learners = planner.learners
         return planner
+
+    def target_of(self, request: Request) -> str:
+        """The file in which a render saves what it learns; empty for none."""
+        return request.save_learned or self.save_learned
 
     def _learned_by(self, sensor: mi.Sensor) -> str:
         """On what, besides the scene, learned states depend."""
@@ -248,8 +262,9 @@ class WalkIntegrator(StagedIntegrator):
         width, height = film_extent(sensor.film())
         return ", ".join([*slots, f"film = {width}x{height}"])
 
-    def _loaded(self, scene: mi.Scene, sensor: mi.Sensor) -> dict[str, StoredArrays]:
-        file = self.file_of("load_learned", scene, self._learned_by(sensor))
+    def _loaded(self, request: Request) -> dict[str, StoredArrays]:
+        made_by = self._learned_by(request.sensor)
+        file = self.file_of("load_learned", request.scene, made_by, request.load_learned)
         if (stored := file.load()) is None:
             raise FileNotFoundError(
                 f'{file.where} names "{file.path}", which does not exist: give it a file that '
@@ -257,21 +272,18 @@ class WalkIntegrator(StagedIntegrator):
             )
         return stored.parts()
 
-    def _savers(
-        self, scene: mi.Scene, sensor: mi.Sensor, pilot_spp: int
-    ) -> list[Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]]:
+    def _savers(self, request: Request, pilot_spp: int) -> list[Saver]:
         """The functions that save what is learned, in a file and for this process."""
-        made_by, savers = self._learned_by(sensor), []
-        if file := self.file_of("save_learned", scene, made_by):
+        scene, made_by, savers = request.scene, self._learned_by(request.sensor), []
+        if file := self.file_of("save_learned", scene, made_by, request.save_learned):
             savers.append(file.save)
         if self.keep_learned and pilot_spp:
             savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
         return savers
 
-    def estimators(
-        self, scene: mi.Scene, sensor: mi.Sensor, learning: LearningPlan
-    ) -> Callable[[Decisions, Observer | None], Estimator]:
-        """The function that makes the estimator of a stage: :meth:`walk`."""
+    def estimators(self, request: Request, spp: int, learning: LearningPlan) -> Estimators:
+        """The function that makes the estimators of the stages of a render with ``spp`` samples per
+        pixel: :meth:`walk`."""
         return self.walk
 
     def walk(

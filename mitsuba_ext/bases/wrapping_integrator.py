@@ -10,8 +10,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..rendering.plan import Learning
-from ..rendering.stages import OneStage, Schedule, Stage
+from ..rendering.request import Request
+from ..rendering.staged import is_staged
+from ..rendering.stages import Learning, OneStage, Schedule, Stage
 from ..scene.nesting import refuse_checkpoint
 from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
@@ -70,14 +71,14 @@ class WrappingIntegrator(StagedIntegrator):
         return {**super().parameters(), "nested": nested}
 
     def plan_learning(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+        self, request: Request, spp: int, kernels: float = math.inf
     ) -> Learning:
         if not self._is_staged:
             return Learning()
-        return self.nested.plan_learning(scene, sensor, spp, kernels)
+        return self.nested.plan_learning(request, spp, kernels)
 
-    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
-        return self.nested.pace_stage(scene, sensor, spp) if self._is_staged else None
+    def pace_stage(self, request: Request, spp: int) -> Stage | None:
+        return self.nested.pace_stage(request, spp) if self._is_staged else None
 
     @property
     def sample_cost(self) -> int:
@@ -92,15 +93,12 @@ class WrappingIntegrator(StagedIntegrator):
         return self.nested.needs_equal_samples if self._is_staged else ""
 
     def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
-        learning: Learning,
-    ) -> Schedule:  # fmt: skip
+        self, request: Request, samples: tuple[int, ...], learning: Learning
+    ) -> Schedule:
         if self._is_staged:
-            # The size of point sets depends on the timeout, and must be the same for all of them
-            self.nested.timeout = self.timeout
-            return self.nested.schedule(scene, sensor, samples, seed, learning)
-        check_all_is_seen(self.nested, scene)
-        return OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
+            return self.nested.schedule(request, samples, learning)
+        check_all_is_seen(self.nested, request.scene)
+        return OneStage(_NestedEstimator(self.nested, request.sensor.get_medium()))
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """A sample of the nested integrator, for a ray that another integrator has sampled."""
@@ -140,9 +138,8 @@ class WrappingIntegrator(StagedIntegrator):
 
     @property
     def _is_staged(self) -> bool:
-        """Is the nested integrator one of ours, which can learn in pilots?"""
-        # Not `isinstance`: once another variant is selected, the module holds that variant's class
-        return hasattr(self.nested, "schedule")
+        """Whether the nested integrator is one of ours, which can learn in pilots."""
+        return is_staged(self.nested)
 
 
 class _NestedEstimator:

@@ -13,7 +13,8 @@ from rich.progress import Progress
 from ..compare import timing
 from ..inputs.chosen import Chosen
 from ..rendering.batches import sample_count
-from ..rendering.seed_passes import SeedPasses, can_render, is_independent
+from ..rendering.plan import is_independent
+from ..rendering.seed_passes import SeedPasses, can_render
 from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..util.errors import InputError, one_line
 from .reports import Report, Speed, time_left

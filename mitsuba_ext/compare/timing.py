@@ -6,11 +6,13 @@ import gc
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..rendering.batches import sample_count
 from ..rendering.camera import film_extent, forget_state
-from ..rendering.seed_passes import is_independent
+from ..rendering.plan import is_independent
+from ..rendering.request import Request
+from ..rendering.staged import is_staged
 from ..rendering.statistics import RenderStatistics
 from ..scene.unseen import check_all_is_seen
 
@@ -58,8 +60,10 @@ def timed_render(
     spp: int,
     sensor: int = 0,
     cpu_time: bool = False,
+    **wishes: Any,
 ) -> Timed:
-    """Renders and waits for the image. ``spp`` 0 stands for the number of the scene's sampler.
+    """Renders and waits for the image. ``spp`` 0 stands for the number of the scene's sampler;
+    ``wishes`` are further arguments of the integrator's ``render()``.
 
     Raises:
         NotImplementedError: The scene has moving shapes, and the integrator does not support them.
@@ -78,7 +82,7 @@ def timed_render(
         dr.kernel_history_clear()
         start = clock()
         image = integrator.render(
-            scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True
+            scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True, **wishes
         )
         dr.eval(image)
         dr.sync_thread()
@@ -108,13 +112,12 @@ def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) 
     learn. Often, no number of samples takes a given time.
     """
     view = scene.sensors()[sensor]
-    if not (hasattr(integrator, "pace_stage") and is_independent(view)):
+    if not (is_staged(integrator) and is_independent(view)):
         return False
-    spp = _more_than_fit(view)
-    learns = integrator.plan_learning(scene, view, spp).pilots
-    # With a timeout, sample sets would be smaller
+    request, spp = Request(scene, view), _more_than_fit(view)
+    learns = integrator.plan_learning(request, spp).pilots
     has_sets = integrator.samples_per_set(spp) > 1
-    return bool(learns and not has_sets and integrator.pace_stage(scene, view, spp))
+    return bool(learns and not has_sets and integrator.pace_stage(request, spp))
 
 
 def render_for(
@@ -123,12 +126,9 @@ def render_for(
     """Renders for ``seconds`` with an integrator for which :func:`plans_for_time` is true, like
     :func:`timed_render` with the parameter ``timeout``."""
     own = integrator.timeout
-    integrator.timeout = min(own, seconds) if own > 0 else seconds
-    try:
-        spp = _more_than_fit(scene.sensors()[sensor])
-        return timed_render(integrator, scene, seed, spp, sensor)
-    finally:
-        integrator.timeout = own
+    timeout = min(own, seconds) if own > 0 else seconds
+    spp = _more_than_fit(scene.sensors()[sensor])
+    return timed_render(integrator, scene, seed, spp, sensor, timeout=timeout)
 
 
 def _more_than_fit(sensor: mi.Sensor) -> int:

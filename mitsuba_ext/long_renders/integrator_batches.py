@@ -6,6 +6,7 @@ import math
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,9 @@ import numpy as np
 from ..rendering.batches import batch_seeds, each_batch, sample_count
 from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
-from ..rendering.seed_passes import can_render, is_independent, pass_length
+from ..rendering.plan import is_independent
+from ..rendering.seed_passes import can_render, pass_length
+from ..rendering.staged import is_staged
 from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..util.errors import InputError
 from .state import Batch, BatchResult, image_shape
@@ -92,21 +95,15 @@ class IntegratorBatches:
         """
         if not self.learns:
             return self._rendered(batch)
-        integrator = self._integrator
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "learned.npz"
             if learned:
                 file.write_bytes(learned)
-                integrator.load_learned = str(file)
-            elif learned is None:
-                integrator.save_learned = str(file)
-            try:
-                result = self._rendered(batch)
-            finally:
-                integrator.load_learned = integrator.save_learned = ""
-            if learned is None:
-                result = result._replace(learned=file.read_bytes() if file.exists() else b"")
-            return result
+                return self._rendered(batch, load_learned=str(file))
+            if learned is not None:
+                return self._rendered(batch)
+            result = self._rendered(batch, save_learned=str(file))
+            return result._replace(learned=file.read_bytes() if file.exists() else b"")
 
     def check(self, result: BatchResult) -> None:
         """Checks the result of a batch rendered by another process.
@@ -122,20 +119,19 @@ class IntegratorBatches:
                 f"{size[0]} pixels: does it run the same version?"
             )
 
-    def _rendered(self, batch: Batch) -> BatchResult:
+    def _rendered(self, batch: Batch, **wishes: Any) -> BatchResult:
+        """Renders a batch. ``wishes`` are attributes of its request."""
         integrator, film = self._integrator, self.sensor.film()
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
         forget_memory_peak()
         begin = time.perf_counter()
-        # Batches may be rendered in any order: count as if all had the usual length
-        before = batch.index * max(batch.spp, self.length(_LARGER_THAN_A_BATCH, False))
-        if hasattr(integrator, "samples_before"):
-            integrator.samples_before = before
-        try:
-            images = next(each_batch(integrator, self._scene, self.sensor, batch.spp, [seed]))
-        finally:
-            if hasattr(integrator, "samples_before"):
-                integrator.samples_before = 0
+        if is_staged(integrator):
+            # Batches may be rendered in any order: count as if all had the usual length
+            before = batch.index * max(batch.spp, self.length(_LARGER_THAN_A_BATCH, False))
+            wishes.update(samples_before=before, is_batch=True, timeout=-1.0, progress=None)
+        images = next(
+            each_batch(integrator, self._scene, self.sensor, batch.spp, [seed], **wishes)
+        )
         totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
         sums = FilmSums()
         sums.add(film, images.spp, getattr(integrator, "film_counts_samples", True))

@@ -9,6 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from ..images import image_files
+from ..rendering.pace import Pace
 from ..util.errors import InputError
 from .announced_error import announced_error
 from .dispatch import QUEUE, Dispatch
@@ -107,7 +108,7 @@ class LongRender:
         measured = 1 + QUEUE * count_workers()
         # Batches that use the learned state have a different speed
         plans = (measured, measured + 2) if self._teaches_late else (measured,)
-        begin, warm, count = time.perf_counter(), 0.0, 0
+        end, warm, count = time.perf_counter() + (goal.seconds or 0.0), 0.0, 0
         while not self._is_reached():
             if is_stopped() or (result := next(results, None)) is None:
                 return False
@@ -118,8 +119,10 @@ class LongRender:
                 # Its time is not measured because it may have compiled kernels or learned
                 warm, before = time.perf_counter(), self.state.spp
             elif goal.seconds is not None and count in plans:
-                seconds = (time.perf_counter() - warm) / (self.state.spp - before)
-                self._plan(goal.seconds - (time.perf_counter() - begin), seconds)
+                pace = Pace()
+                pace.measure(self.state.spp - before, time.perf_counter() - warm)
+                fits = self.state.spp + round(pace.fits(end - time.perf_counter()))
+                self.goal_spp = min(fits, goal.spp or fits)
                 self._probes = False
             self._progress(self)
         return True
@@ -160,12 +163,6 @@ class LongRender:
                 f"has no relative error that could be reached: also limit the samples or the time"
             )
         return error is not None and error <= limit
-
-    def _plan(self, left: float, seconds: float) -> None:
-        """Sets the goal to the samples that fit into ``left`` seconds; ``seconds`` is the time of
-        one sample per pixel."""
-        fits = self.state.spp + max(0, round(left / seconds))
-        self.goal_spp = min(fits, self._goal.spp or fits)
 
     @property
     def _learned(self) -> bytes | None:

@@ -10,8 +10,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..rendering.plan import Learning
-from ..rendering.stages import Schedule, Stage
+from ..rendering.stages import Learning, Schedule, Stage
+from ..rendering.statistics import RenderStatistics
 from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer, Observers
@@ -32,6 +32,9 @@ _PILOTS_BEFORE_TRIAL = 2
 
 #: Called with what was learned, by slot.
 Saver = Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]
+
+#: Makes the estimator of a stage from its decisions and the observer of its samples.
+Estimators = Callable[[Decisions, "Observer | None"], Estimator]
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class Planner(Schedule):
         techniques: Mapping[str, Technique],
         setting: Setting,
         stages: Sequence[int],
-        estimator: Callable[[Decisions, Observer | None], Estimator],
+        estimator: Estimators,
         decisions: Decisions,
         learning: LearningPlan,
         savers: Sequence[Saver] = (),
@@ -155,6 +158,9 @@ class Planner(Schedule):
         if not self._is_tried:
             self._is_tried, self._trial = True, None
         self._pilot_count = self._finished_stages + 1
+
+    def finish(self, statistics: RenderStatistics) -> None:
+        """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
 
     # ---- Pilots ----
 

@@ -201,7 +201,7 @@ class Technique:
         """Whether ``spp`` pilot samples per pixel can learn something in ``scene``."""
         return False
 
-    def samples_per_set(self, spp: int, is_timed: bool) -> int:
+    def samples_per_set(self, spp: int) -> int:
         """How many of the ``spp`` samples of a pixel a timeout must not separate."""
         return 1
 

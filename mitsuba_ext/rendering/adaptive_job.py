@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 import drjit as dr
@@ -12,11 +11,12 @@ import numpy as np
 
 from ..util.arrays import channel_mean, from_numpy
 from . import camera
+from .pass_timer import PassTimer
 from .pixel_moments import PixelMoments
-from .render import Job, kernel_cache_misses, kernels_compiled
+from .render import Job
+from .request import Request
 from .sample_allocation import SampleAllocation
 from .stages import Stage
-from .time_budget import TimeBudget
 from .turns import tell
 
 #: By default, each pass takes all samples divided by this number.
@@ -36,14 +36,14 @@ class AdaptiveJob(Job):
 
     divides_stages = False  # moments are those of whole passes
 
-    def __init__(self, integrator, scene, sensor, seed, spp) -> None:
-        if sensor.sampler().class_name() == "StratifiedSampler":
+    def __init__(self, integrator, request: Request) -> None:
+        if request.sensor.sampler().class_name() == "StratifiedSampler":
             raise NotImplementedError(
                 f'"{integrator.name}": in sets of a few samples, the numbers of the sampler '
                 f'"stratified" depend on each other, and the image would be biased: use '
                 f'"multijitter" or "independent".'
             )
-        super().__init__(integrator, scene, sensor, seed, spp)
+        super().__init__(integrator, request)
         spp, pilot_spp = self.plan.spp, sum(self.plan.stages[:-1])
         self._pass_spp = min(integrator.pass_spp or -(-spp // _PASS_SHARE), spp)
         self._set_size = 1
@@ -63,10 +63,9 @@ class AdaptiveJob(Job):
         self.allocation = SampleAllocation(
             self.moments, spp, first, integrator.threshold, self._set_size
         )
-        self.budget = TimeBudget(integrator.timeout, self.start, self.plan.pixel_count, first)
+        self.limit.pilot_spp = first
         most = min(self.plan.limit * self.plan.pixel_count, integrator.most_lanes)
         self._most_sets = max(1, most // self._set_size)
-        self._seconds_per_sample = 0.0
 
     def _run_stage(
         self, stage: Stage, samples: int, is_last: bool, interrupt: threading.Event
@@ -85,10 +84,10 @@ class AdaptiveJob(Job):
             passes = max(1, round(budget / (self._pass_spp * self.plan.pixel_count)))
             sets, weight = self.allocation.next(budget / passes, passes == 1, 1 / passes)
             self._run_sets(stage, sets, weight)
-            if self.integrator.progress is not None:
+            if self.request.progress is not None:
                 is_done = passes == 1 or not self.allocation.is_active.any()
                 done = int(self.moments.count.sum())
-                tell(self.integrator.progress, 1.0 if is_done else done / (done + left))
+                tell(self.request.progress, 1.0 if is_done else done / (done + left))
         self.statistics.interrupted = self._stopped(interrupt) and bool(
             self.allocation.is_active.any()
         )
@@ -96,9 +95,9 @@ class AdaptiveJob(Job):
     def _samples_that_fit(self) -> float | None:
         """The number of samples that fit into the time left; ``None`` if there is no limit, or the
         speed is not known yet."""
-        if not self.budget.is_limited or self._seconds_per_sample == 0:
+        if not self.limit.is_limited or self.limit.seconds == 0:
             return None
-        return max(1.0, (self.budget.end - time.perf_counter()) / self._seconds_per_sample)
+        return max(1.0, self.limit.fits(self.limit.left) * self.plan.pixel_count)
 
     def run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples of every pixel."""
@@ -107,23 +106,23 @@ class AdaptiveJob(Job):
     def _run_sets(self, stage: Stage, sets: np.ndarray, weight: np.ndarray) -> bool:
         """Renders ``sets`` sets of each pixel into the block. Returns True if it compiled a
         kernel."""
-        begin, misses, before = time.perf_counter(), kernel_cache_misses(), kernels_compiled()
+        timer = PassTimer()
         pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
         table = from_numpy(mi.Float, weight)
         for start in range(0, len(pixels), self._most_sets):
             self._run_part_of_sets(stage, pixels[start : start + self._most_sets], table)
-        seconds, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
-        if kernels_compiled() > before:
+        seconds, compiled = timer.seconds, timer.has_new_kernels
+        if timer.has_compiled:
             self.statistics.compile_seconds += seconds
         if not compiled and len(pixels):
-            self._seconds_per_sample = seconds / (len(pixels) * self._set_size)
+            self.limit.measure(len(pixels) * self._set_size / self.plan.pixel_count, seconds)
         self.statistics.spp = round(self.moments.count.sum() / self.plan.pixel_count)
         return compiled
 
     def _run_part_of_sets(self, stage: Stage, pixels: np.ndarray, weight: mi.Float) -> None:
         size = len(pixels) * self._set_size
         sampler = self.sampler.clone()
-        seed = self.plan.seed
+        seed = self.request.seed
         if self.statistics.passes > 0:
             seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(self.statistics.passes))[0][0]
         sampler.seed(dr.opaque(mi.UInt32, seed), size)

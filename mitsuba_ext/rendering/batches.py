@@ -7,8 +7,9 @@ through ``sample()`` (light tracing, Metropolis) or whose samples depend on each
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -147,6 +148,7 @@ def each_batch(
     batch_spp: int,
     seeds: Iterable[int],
     batches: Batches | None = None,
+    **wishes: Any,
 ) -> Iterator[Batches]:
     """Renders one batch per seed, and yields the same :class:`Batches` object after each. The
     caller may stop at any time, and keeps the finished batches after an exception.
@@ -157,6 +159,7 @@ def each_batch(
         seeds: Seeds of the batches, by :func:`batch_seeds`. With others, images could be correlated
             by the way in which integrators and samplers use their seed.
         batches: Earlier batches to continue.
+        wishes: Further arguments of the integrator's ``render()``.
 
     Raises:
         NotImplementedError: The scene has moving shapes, and the integrator does not support them.
@@ -167,7 +170,7 @@ def each_batch(
     # Removes the AOVs of an earlier render
     sensor.film().prepare([])
     for seed in seeds:
-        image = _render(integrator, scene, sensor, batch_spp, seed)
+        image = _render(integrator, scene, sensor, batch_spp, seed, wishes)
         if batches is None:
             batches = _no_batches(sensor.film())
         batches.add(_complete(image, sensor.film(), len(batches.channels)), batch_spp)
@@ -208,15 +211,16 @@ def sample_count(sensor: mi.Sensor, spp: int) -> int:
 
 
 def _render(
-    integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int
-) -> np.ndarray:
+    integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int,
+    wishes: Mapping[str, Any],
+) -> np.ndarray:  # fmt: skip
     sampler = sensor.sampler()
     before = sampler.sample_count()
     try:
         with dr.suspend_grad(), garbage_left_alone(), film_told(sensor):
             # "prb" refuses develop=False
             return integrator.render(
-                scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True
+                scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True, **wishes
             ).numpy()
     finally:
         sampler.set_sample_count(before)  # Mitsuba's integrators change it

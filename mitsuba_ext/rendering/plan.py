@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +12,9 @@ import mitsuba as mi
 from ..util.parameters import MOST_SPP
 from .batches import NO_SAMPLES
 from .camera import film_extent
+from .request import Request
+from .staged import Staged
+from .stages import Learning
 
 #: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
 #: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
@@ -38,63 +40,21 @@ _MOST_PASSES = 1 << 20
 
 
 @dataclass(frozen=True)
-class Learning:
-    """What a render learns. Integrators that learn extend it by what their schedules need.
-
-    Attributes:
-        pilots: Samples per pixel of each pilot stage; empty if nothing is learned.
-    """
-
-    pilots: tuple[int, ...] = ()
-
-
-class Planned(Protocol):
-    """The attributes and methods of an integrator that the plan of a render uses."""
-
-    name: str
-    timeout: float
-    samples_per_pass: int
-
-    @property
-    def sample_cost(self) -> int:
-        """The approximate time of a sample, in units of the time of a path."""
-
-    @property
-    def most_lanes(self) -> int:
-        """Largest number of samples that are taken at a time, limited by memory."""
-
-    def plan_learning(
-        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
-    ) -> Learning:
-        """What a render of ``spp`` samples per pixel learns.
-
-        Parameters:
-            scene, sensor: What is rendered.
-            kernels: How many kernels as large as that of ``path`` learning may compile.
-        """
-
-    def samples_per_set(self, spp: int) -> int:
-        """The number of samples of a pixel that a timeout must not separate."""
-
-
-@dataclass(frozen=True)
 class RenderPlan:
     """The samples of a render.
 
     Attributes:
-        seed: Seed of the render.
         spp: Samples per pixel.
         stages: Samples per pixel of each stage: pilots, and the last one.
         learning: What the pilots are for.
         pixel_count: Sampled pixels of the film.
-        structured: Are the samples stratified over the whole render? Then all passes have the same
-            length.
+        structured: Whether the samples are stratified over the whole render. All passes then have
+            the same length.
         limit: Largest number of samples per pixel in a pass.
         set_size: Number of samples of a pixel that a timeout does not separate.
         parts: Number of parts of the film, which each pass renders one after the other.
     """
 
-    seed: int
     spp: int
     stages: tuple[int, ...]
     learning: Learning
@@ -133,16 +93,14 @@ class RenderPlan:
         return min(most, samples + -(before + samples) % self.set_size)
 
 
-def plan_render(
-    integrator: Planned, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler, seed: int,
-    spp: int,
-) -> RenderPlan:  # fmt: skip
-    """The plan of ``integrator.render(scene, …)``. Sets the sampler's number of samples.
+def plan_render(integrator: Staged, request: Request, sampler: mi.Sampler) -> RenderPlan:
+    """The plan of a render. Sets the sampler's number of samples.
 
     Raises:
         ValueError: ``spp`` is out of range, the film has more pixels than a wavefront can hold, or
             ``spp`` is too large for this number of pixels.
     """
+    spp, film = request.spp, request.sensor.film()
     if not 0 <= spp <= MOST_SPP:
         raise ValueError(
             f'"{integrator.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
@@ -153,15 +111,14 @@ def plan_render(
     spp = sampler.sample_count()
     if spp == 0:
         raise ValueError(f'"{integrator.name}": {NO_SAMPLES}')
-    check_extent(sensor.film())
-    pixel_count = math.prod(film_extent(sensor.film()))
-    structured = sampler.class_name() != "IndependentSampler"
+    check_extent(film)
+    pixel_count = math.prod(film_extent(film))
+    structured = not is_independent(request.sensor)
     cost = integrator.sample_cost
     limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
     if not structured:
         limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
-    is_timed = integrator.timeout > 0
-    if structured and is_timed:
+    if structured and request.is_timed:
         limit //= _TIMEOUT_PASS_DIVISOR
     limit = min(limit, integrator.samples_per_pass, integrator.most_lanes // pixel_count)
     limit = max(1, limit)
@@ -170,10 +127,10 @@ def plan_render(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
             f"are too many: give at most {limit * _MOST_PASSES}"
         )
-    learning = integrator.plan_learning(scene, sensor, spp)
+    learning = integrator.plan_learning(request, spp)
     pilots = list(learning.pilots)
     # With a timeout, sets of samples are kept whole
-    set_size = integrator.samples_per_set(spp) if is_timed else 1
+    set_size = integrator.samples_per_set(spp) if request.is_timed else 1
     if structured:
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length, to which
@@ -185,14 +142,17 @@ def plan_render(
     stages = (*pilots, spp - sum(pilots))
     # More than one part if even one sample of each pixel is too much at a time
     parts = -(-pixel_count // integrator.most_lanes)
-    return RenderPlan(
-        seed, spp, stages, learning, pixel_count, structured, limit, set_size, parts
-    )
+    return RenderPlan(spp, stages, learning, pixel_count, structured, limit, set_size, parts)
 
 
 def _divides(length: int, spp: int, set_size: int) -> bool:
-    """Can the samples be cut into passes of this length?"""
+    """Whether the samples can be cut into passes of this length."""
     return spp % length == 0 and (set_size % length == 0 or length % set_size == 0)
+
+
+def is_independent(sensor: mi.Sensor) -> bool:
+    """Whether the sensor's sampler draws each sample independently of the pixel's others."""
+    return sensor.sampler().class_name() == "IndependentSampler"
 
 
 def check_extent(film: mi.Film) -> None:

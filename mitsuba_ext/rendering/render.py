@@ -8,11 +8,8 @@ depend on the number of samples, and all passes of a stage run the same kernel.
 
 from __future__ import annotations
 
-import operator
 import threading
 import time
-from collections.abc import Callable
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -27,74 +24,36 @@ from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt, interrupted
-from .pace import plan_for_timeout
+from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
-from .plan import Learning, Planned, plan_render
+from .pass_timer import PassTimer
+from .plan import plan_render
+from .request import Request
+from .staged import Staged
 from .stages import Schedule, Stage
 from .statistics import RenderStatistics
-from .time_budget import TimeBudget
 from .turns import let_others, tell
 
 
-class Staged(Planned, Protocol):
-    """The attributes and methods of an integrator that :func:`render` uses."""
+def render(integrator: Staged, request: Request, job: type[Job] | None = None) -> mi.TensorXf:
+    """Renders a scene with the estimators that ``integrator.schedule()`` makes. The statistics are
+    left in ``integrator.statistics``.
 
-    progress: Callable[[float], None] | None
-    statistics: RenderStatistics
-    is_cancelled: bool
-
-    def schedule(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int,
-        learning: Learning,
-    ) -> Schedule:  # fmt: skip
-        """The schedule of a render, whose stages take ``samples`` samples per pixel, and which
-        learns as planned."""
-
-    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
-        """The stage with which a render with a timeout, of at most ``spp`` samples per pixel,
-        measures its speed (``pace.py``); ``None`` if the first pilot does that."""
-
-    def aov_names(self) -> list[str]:
-        """Channels besides colour and alpha."""
-
-    def sample_aovs(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
-    ) -> list[mi.Float]:
-        """The values of these channels for camera rays, without those that the estimator returns
-        (:attr:`Sample.aovs`)."""
-
-    def no_gradients(self) -> NotImplementedError:
-        """The exception to raise if gradients are requested."""
-
-
-def render(
-    integrator: Staged,
-    scene: mi.Scene,
-    sensor: int | mi.Sensor,
-    seed: int | mi.UInt32,
-    spp: int,
-    develop: bool,
-    evaluate: bool,
-    job: type[Job] | None = None,
-) -> mi.TensorXf:
-    """Renders ``scene`` with the estimators that ``integrator.schedule()`` makes.
-
-    Parameters are those of ``mi.Integrator.render``, and ``job``: the class that distributes the
-    samples, if pixels do not get equal numbers. The statistics are left in
-    ``integrator.statistics``.
+    Parameters:
+        job: The class that distributes the samples, if pixels do not get equal numbers.
 
     Raises:
-        ValueError: There is no such sensor, ``spp`` is out of range, the film has more pixels than
-            a wavefront can hold, or ``spp`` is too large for this number of pixels.
+        ValueError: ``spp`` is out of range, the film has more pixels than a wavefront can hold, or
+            ``spp`` is too large for this number of pixels.
         NotImplementedError: The integrator has AOVs, and the film is a special one; or parameters
             of the scene have gradients.
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
-    sensor = camera.find_sensor(scene, sensor)
+    scene, sensor = request.scene, request.sensor
 
     def attempt() -> tuple[Job, threading.Event]:
-        made = (job or Job)(integrator, scene, sensor, seed, spp)
+        made = (job or Job)(integrator, request)
         try:
             with deferred_interrupt() as interrupt:
                 made.run(interrupt)
@@ -111,34 +70,33 @@ def render(
         # Another scene has them: Dr.Jit traces the methods of all BSDFs and lights in memory
         with dr.suspend_grad():
             made, interrupt = with_recordings(scene, sensor, attempt)
-    image = camera.develop(sensor.film(), develop, evaluate)
+    image = camera.develop(sensor.film(), request.develop, request.evaluate)
     made.finish()
     if interrupt.is_set():
         raise interrupted(integrator.name)
+    made.schedule.finish(made.statistics)
     return image
 
 
 class Job:
     """One call of :func:`render`."""
 
-    #: Can a stage take samples of a part of the pixels?
+    #: Whether a stage can take samples of a part of the pixels.
     divides_stages = True
 
-    #: May a whole pass be recorded (``frozen.py``)? False if a subclass reads the samples.
+    #: Whether a whole pass may be recorded (``frozen.py``). False if a subclass reads the samples.
     freezes_passes = True
 
-    def __init__(self, integrator, scene, sensor, seed, spp) -> None:
+    schedule: Schedule
+
+    def __init__(self, integrator: Staged, request: Request) -> None:
         self.start = time.perf_counter()
         self._kernels = dr.detail.launch_stats()
         dr.detail.malloc_clear_statistics()
-        self.integrator, self.scene, self.sensor, self.film = (
-            integrator, scene, sensor, sensor.film(),
-        )
-        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
-        self.sampler = camera.own_sampler(sensor)
-        self.plan = plan_render(
-            integrator, scene, sensor, self.sampler, seed & 0xFFFFFFFF, spp
-        )
+        self.integrator, self.request = integrator, request
+        self.scene, self.sensor, self.film = request.scene, request.sensor, request.sensor.film()
+        self.sampler = camera.own_sampler(self.sensor)
+        self.plan = plan_render(integrator, request, self.sampler)
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
         aovs = integrator.aov_names()
@@ -157,9 +115,8 @@ class Job:
             for index, sampler in enumerate(self.samplers):
                 sampler.set_samples_per_wavefront(self.plan.limit)
                 self._seed(sampler, index, self.plan.limit, self.parts[index])
-        pilot_spp = sum(self.plan.stages[:-1])
-        self.budget = TimeBudget(
-            integrator.timeout, self.start, self.plan.pixel_count, pilot_spp
+        self.limit = TimeLimit(
+            request.timeout, self.start, self.plan.pixel_count, sum(self.plan.stages[:-1])
         )
         self.block, self.splats = self.film.create_block(), None
         # One kernel for all passes: coalescing is decided once
@@ -175,7 +132,7 @@ class Job:
     ) -> None:
         """Seeds a sampler for part ``index``, counted over all passes. The first one is seeded as
         in Mitsuba's own integrators, so that it draws the same numbers."""
-        seed = self.plan.seed
+        seed = self.request.seed
         if index > 0:
             seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
         camera.tell_film(sampler, self.film, getattr(pixels, "start", 0))
@@ -189,8 +146,8 @@ class Job:
         )
         self.statistics.interrupted = True  # until the last stage has all its samples
         plan = self.plan = plan_for_timeout(self)
-        schedule = self.integrator.schedule(
-            self.scene, self.sensor, plan.stages, plan.seed, plan.learning
+        schedule = self.schedule = self.integrator.schedule(
+            self.request, plan.stages, plan.learning
         )
         parts = self._first_parts(schedule)
         for index, samples in enumerate(plan.stages):
@@ -201,7 +158,7 @@ class Job:
                 continue
             is_last = index == len(plan.stages) - 1
             # The first two pilots find out what can be learned, and test it
-            if index >= 2 and self.budget.ends_learning(0 if is_last else samples):
+            if index >= 2 and self.limit.ends_learning(0 if is_last else samples):
                 schedule.end_learning()
                 if not is_last:
                     continue
@@ -220,16 +177,16 @@ class Job:
     def _run_stage(self, stage: Stage, samples: int, is_last: bool, interrupt) -> None:
         """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
-        budget = self.budget.stage(samples, before, is_last)
+        known = StageSamples(self.limit, samples, before, is_last)
         discards = stage.discards_earlier
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         if stage.images is not None and not self.plan.structured:
             length = min(length, -(-samples // FEWEST_PASSES))
-        while done < (wanted := self.plan.whole(before, budget.samples, samples)):
+        while done < (wanted := self.plan.whole(before, known.samples, samples)):
             if self._stopped(interrupt):
                 return
-            spp = length if self.plan.structured else min(length, budget.longest, wanted - done)
-            begin = time.perf_counter()
+            spp = length if self.plan.structured else min(length, known.longest, wanted - done)
+            timer = PassTimer()
             if discards:
                 # Not before there are others
                 discards, self.forgotten = False, before
@@ -242,12 +199,12 @@ class Job:
             if stage.images is not None:
                 stage.images.add(self.block, self.splats, before + done)
             if not compiled:
-                budget.passed(spp, done, time.perf_counter() - begin)
-            if self.integrator.progress is not None:
-                is_known = is_last and not budget.is_open
-                wanted = max(done, self.plan.whole(before, budget.samples, samples))
+                known.passed(spp, done, timer.seconds)
+            if self.request.progress is not None:
+                is_known = is_last and not known.is_open
+                wanted = max(done, self.plan.whole(before, known.samples, samples))
                 total = before + wanted if is_known else self.plan.spp
-                tell(self.integrator.progress, (before + done) / total)
+                tell(self.request.progress, (before + done) / total)
         self.statistics.interrupted = not is_last
 
     def _next_stage(self, schedule: Schedule) -> Stage:
@@ -266,29 +223,28 @@ class Job:
     def _run_divided(self, schedule: Schedule, parts: list[np.ndarray]) -> None:
         """Takes one sample of each pixel, in a stage for each part of them."""
         for pixels in parts:
-            stage, begin = self._next_stage(schedule), time.perf_counter()
-            before = kernels_compiled()
+            stage, timer = self._next_stage(schedule), PassTimer()
             sampler = self.sampler.clone()
             self._seed(sampler, self.statistics.passes, 1, pixels)
             pixel = from_numpy(mi.UInt32, pixels)
             lanes = camera.lanes_at(self.film, pixel, dr.opaque(mi.UInt32, 0))
             self._take(stage, sampler, lanes)
-            self._add_tracing(begin, before)
+            self._add_tracing(timer)
             dr.sync_thread()
             self.statistics.passes += 1
             self.statistics.rays["camera"] += len(pixels)
         self.statistics.spp += 1
 
     def _stopped(self, interrupt: threading.Event) -> bool:
-        """Is it time to stop? Asked between passes, where other threads get their turn."""
+        """Whether to stop. Called between passes, where other threads get their turn."""
         let_others()
         return interrupt.is_set() or self.integrator.is_cancelled
 
     def _run_scout(self, stage: Stage) -> None:
-        begin, before = time.perf_counter(), kernels_compiled()
+        timer = PassTimer()
         for pixels in self.parts if stage.pixels is None else [stage.pixels]:
             self._scout(stage, pixels)
-        self._add_tracing(begin, before)
+        self._add_tracing(timer)
         dr.sync_thread()
 
     def _scout(self, stage: Stage, pixels: range | np.ndarray | None) -> None:
@@ -322,21 +278,19 @@ class Job:
     def run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block. Returns True if it compiled a
         kernel."""
-        begin = time.perf_counter()
-        misses, before = kernel_cache_misses(), kernels_compiled()
+        timer = PassTimer()
         for part in range(len(self.parts)):
             self._run_part(stage, spp, part)
-        self._add_tracing(begin, before)
+        self._add_tracing(timer)
         dr.sync_thread()
 
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
-        return kernel_cache_misses() > misses
+        return timer.has_new_kernels
 
-    def _add_tracing(self, begin: float, compiled: int) -> None:
-        seconds = time.perf_counter() - begin
-        self.statistics.add_tracing(seconds, kernels_compiled() > compiled)
+    def _add_tracing(self, timer: PassTimer) -> None:
+        self.statistics.add_tracing(timer.seconds, timer.has_compiled)
 
     def _run_part(self, stage: Stage, spp: int, part: int) -> None:
         sampler, pixels = self._part_sampler(spp, part), self.parts[part]
@@ -353,7 +307,7 @@ class Job:
         self._finish_take(sampler)
 
     def _is_frozen(self, stage: Stage) -> bool:
-        """Are the passes of this stage recorded (``frozen.py``)?"""
+        """Whether the passes of this stage are recorded (``frozen.py``)."""
         if not self.freezes_passes or self.integrator.aov_names():
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
@@ -429,14 +383,3 @@ class Job:
             f"(took {statistics.seconds:.2f}s, {statistics.passes} pass(es), "
             f"{statistics.spp} of {self.plan.spp} samples)",
         )
-
-
-def kernel_cache_misses() -> int:
-    """The number of kernels that this process has compiled, or loaded from the disk."""
-    _launches, soft_misses, hard_misses = dr.detail.launch_stats()
-    return soft_misses + hard_misses
-
-
-def kernels_compiled() -> int:
-    """The number of kernels that this process has compiled: they were in no cache."""
-    return dr.detail.launch_stats()[2]

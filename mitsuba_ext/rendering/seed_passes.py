@@ -7,7 +7,6 @@ Here, each pass calls it for some of the samples, with a seed of its own.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
 import drjit as dr
@@ -20,8 +19,9 @@ from .batches import sample_count
 from .camera import film_extent, film_told
 from .film_sums import FilmSums
 from .interrupts import deferred_interrupt
-from .plan import check_extent
-from .render import kernel_cache_misses
+from .pace import Pace
+from .pass_timer import PassTimer
+from .plan import check_extent, is_independent
 
 #: Approximate number of samples of a pass: one or two seconds on two CPU cores. It must not depend
 #: on the speed, so that the same seed gives the same image.
@@ -46,8 +46,8 @@ _STREAM = 1 << 31
 
 
 def can_render(integrator: mi.Integrator) -> bool:
-    """Is the variant a JIT variant, and are the integrator and all integrators nested in it
-    Mitsuba's own? Others may learn, and would learn again in each pass. In scalar variants,
+    """Whether the variant is a JIT variant, and the integrator and all integrators nested in it are
+    Mitsuba's own. Others may learn, and would learn again in each pass. In scalar variants,
     Mitsuba's integrators can be stopped without passes."""
     modules = {type(each).__module__.split(".")[0] for each in with_nested(integrator)}
     return dr.is_jit_v(mi.Float) and modules == {"mitsuba"}
@@ -68,11 +68,6 @@ def pass_length(sensor: mi.Sensor, is_timed: bool = False) -> int:
     return sample_count(sensor, 1 << (limit.bit_length() - 1))
 
 
-def is_independent(sensor: mi.Sensor) -> bool:
-    """Does the sensor's sampler draw each sample independently of the pixel's other samples?"""
-    return sensor.sampler().class_name() == "IndependentSampler"
-
-
 class SeedPasses:
     """A render with an integrator for which :func:`can_render` is true.
 
@@ -82,7 +77,7 @@ class SeedPasses:
     Attributes:
         passes: Passes whose samples are in the film.
         spp: Samples per pixel of these passes.
-        interrupted: Did Ctrl-C or an error end the render before all samples were taken?
+        interrupted: Whether Ctrl-C or an error ended the render before all samples were taken.
 
     Raises:
         NotImplementedError: The scene has moving shapes, which such integrators do not support.
@@ -124,6 +119,7 @@ class SeedPasses:
         """
         length = pass_length(self._sensor, seconds is not None)
         pass_count = -(-spp // length) if seconds is None else math.inf
+        pace = Pace()  # of passes, not of samples
         self.interrupted = True  # until all passes are finished
         asked = self._sensor.sampler().sample_count()
         try:
@@ -132,7 +128,8 @@ class SeedPasses:
                     rest = length if seconds is not None else spp - self.spp
                     elapsed, compiled = self._run_pass(min(length, rest))
                     if pass_count == math.inf and not compiled:
-                        pass_count = max(self.passes, round(seconds / elapsed))
+                        pace.measure(1, elapsed)
+                        pass_count = max(self.passes, round(pace.fits(seconds)))
                     self.interrupted = self.passes < pass_count
                     progress(self.passes / pass_count)
         finally:
@@ -143,15 +140,15 @@ class SeedPasses:
     def _run_pass(self, spp: int) -> tuple[float, bool]:
         """Adds a pass; returns its seconds, and whether it compiled a kernel."""
         spp = sample_count(self._sensor, spp)
-        begin, misses = time.perf_counter(), kernel_cache_misses()
+        timer = PassTimer()
         seed = self._seed if self.passes == 0 else self._scattered_seed()
         # render() develops the film, because "prb" refuses develop=False
         with garbage_left_alone():
             self._integrator.render(self._scene, self._sensor, seed, spp)
         self._sums.add(self._film, spp)
-        elapsed, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
+        elapsed, is_new = timer.seconds, timer.has_new_kernels
         self.passes += 1
-        return elapsed, compiled
+        return elapsed, is_new
 
     def _scattered_seed(self) -> int:
         # A hash, and different from the seeds of batches (see batch_seeds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from ..transport.decisions import CameraSamples
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
 from .pass_images import PassImages
+from .statistics import RenderStatistics
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,17 @@ class Stage:
     images: PassImages | None = None
 
 
+@dataclass(frozen=True)
+class Learning:
+    """What a render learns. Integrators that learn extend it by what their schedules need.
+
+    Attributes:
+        pilots: Samples per pixel of each pilot stage; empty if nothing is learned.
+    """
+
+    pilots: tuple[int, ...] = ()
+
+
 class Schedule(ABC):
     """Makes the stages of one render, one after the other."""
 
@@ -70,6 +82,11 @@ class Schedule(ABC):
     def end_learning(self) -> None:
         """Makes the next stage the last one. Called after a pilot, in renders with a timeout."""
 
+    @abstractmethod
+    def finish(self, statistics: RenderStatistics) -> None:
+        """Called after the render, unless an exception or Ctrl-C ended it. ``statistics`` are those
+        of the render; what they say of it may be added to."""
+
 
 class OneStage(Schedule):
     """The schedule of an estimator that learns nothing."""
@@ -84,6 +101,9 @@ class OneStage(Schedule):
         return 1
 
     def end_learning(self) -> None:
+        pass
+
+    def finish(self, statistics: RenderStatistics) -> None:
         pass
 
 
@@ -105,3 +125,25 @@ class ChangedSchedule(Schedule):
 
     def end_learning(self) -> None:
         self._inner.end_learning()
+
+    def finish(self, statistics: RenderStatistics) -> None:
+        self._inner.finish(statistics)
+
+
+class ReportedSchedule(ChangedSchedule):
+    """A schedule whose render is reported when it has ended.
+
+    Parameters:
+        report: Is called in :meth:`finish`.
+    """
+
+    def __init__(self, inner: Schedule, report: Callable[[RenderStatistics], None]) -> None:
+        super().__init__(inner)
+        self._report = report
+
+    def changed(self, stage: Stage) -> Stage:
+        return stage
+
+    def finish(self, statistics: RenderStatistics) -> None:
+        super().finish(statistics)
+        self._report(statistics)

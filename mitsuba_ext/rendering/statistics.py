@@ -63,5 +63,9 @@ class RenderStatistics:
         else:
             self.tracing_seconds += seconds
 
+    def add_learned(self, text: str) -> None:
+        """Adds to the summary of what was learned."""
+        self.learned = "; ".join(filter(None, (self.learned, text)))
+
     def _repr_html_(self) -> str:
         return statistics_table(self)

@@ -18,6 +18,7 @@ from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.state import Batch, BatchResult, RenderState
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.learned_file import FORM
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.rendering.totals import RenderTotals
 from mitsuba_ext.util import archives
 from mitsuba_ext.util.errors import InputError
@@ -181,9 +182,8 @@ def _saved(name: str, scene: mi.Scene, file: Path) -> dict[str, Any]:
 def _restore(plugin: dict[str, Any], scene: mi.Scene) -> None:
     """Reads what was learned, as a render does before its first sample."""
     integrator = mi.load_dict(plugin)
-    sensor = scene.sensors()[0]
-    plan = integrator.plan_learning(scene, sensor, 4)
-    integrator.schedule(scene, sensor, (4,), 5, plan).next_stage()
+    request = Request(scene, scene.sensors()[0], 5)
+    integrator.schedule(request, (4,), integrator.plan_learning(request, 4)).next_stage()
 
 
 @pytest.mark.parametrize("count", COUNTS)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from mitsuba_ext.rendering import pace
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering import time_budget
 
 
 class Clock:
@@ -34,4 +34,4 @@ class PassClock:
 
         monkeypatch.setattr(rendering.Job, "run_pass", run_on_clock)
         monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
+        monkeypatch.setattr(pace, "_SHORT_PASS", 1)

@@ -114,7 +114,7 @@ class RedistributionRender(ChainRender):
         if stored:
             self._restore(stored.part(f"{PART}/"), image)
         left = max(0, self._spp * self._pixel_count - self._samples)
-        is_timed = self._integrator.timeout > 0
+        is_timed = self._request.is_timed
         size = min(left, self.max_timed_batch if is_timed else self.max_batch)
 
         def act(most: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -11,9 +10,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ...rendering.camera import film_extent
-from ...rendering.render import kernel_cache_misses
+from ...rendering.pace import StageSamples, TimeLimit
+from ...rendering.pass_timer import PassTimer
+from ...rendering.request import Request
 from ...rendering.statistics import RenderStatistics
-from ...rendering.time_budget import TimeBudget
 from ...rendering.turns import let_others, tell
 from .chains import Chains, MutationCounts
 from .looped import LoopedChains
@@ -27,22 +27,19 @@ FIRST_STAGE = 5
 
 
 class Stoppable(Protocol):
-    """The integrator attributes that a render reads."""
+    """The attribute of the integrator that a render reads."""
 
-    timeout: float
     is_cancelled: bool
-    progress: Callable[[float], None] | None
 
 
 class ChainRender:
     """A single render. It adds the light of the chains to camera samples that the film must hold.
 
     Parameters:
-        integrator: The integrator, which has the time limit and says whether the render was
-            cancelled.
+        integrator: The integrator, which says whether the render was cancelled.
         target: The target function of the chains.
-        seed: The seed of the random numbers.
-        spp: The number of samples, or mutations, per pixel.
+        request: What the render is asked for; ``spp`` is the number of samples, or mutations, per
+            pixel.
         camera_spp: The number of camera samples per pixel in the film.
         statistics: The statistics of the render so far, which are updated.
         start: The start time of the render, by ``time.perf_counter``.
@@ -52,14 +49,14 @@ class ChainRender:
         self,
         integrator: Stoppable,
         target: ImageTarget,
-        seed: int,
-        spp: int,
+        request: Request,
         camera_spp: int,
         statistics: RenderStatistics,
         start: float,
     ) -> None:
         self._integrator, self._target = integrator, target
-        self._seed, self._spp, self._camera_spp = seed, spp, camera_spp
+        self._request, self._seed, self._spp = request, request.seed, request.spp
+        self._camera_spp = camera_spp
         self._statistics, self._start = statistics, start
         self._film = target.sensor.film()
         width, height = film_extent(self._film)
@@ -89,21 +86,21 @@ class ChainRender:
         Returns:
             False if the render was interrupted or cancelled before the end.
         """
-        integrator, done = self._integrator, 0
-        budget = TimeBudget(integrator.timeout, self._start, width, 0).stage(count, 0, True)
-        while done < budget.samples:
+        request, done = self._request, 0
+        steps = StageSamples(TimeLimit(request.timeout, self._start, width), count)
+        while done < steps.samples:
             let_others()
-            if interrupt.is_set() or integrator.is_cancelled:
+            if interrupt.is_set() or self._integrator.is_cancelled:
                 return False
-            begin, misses = time.perf_counter(), kernel_cache_misses()
-            made = act(min(budget.longest, budget.samples - done))
+            timer = PassTimer()
+            made = act(min(steps.longest, steps.samples - done))
             done += made
             dr.sync_thread()
-            if kernel_cache_misses() == misses:
-                budget.passed(made, done, time.perf_counter() - begin)
+            if not timer.has_new_kernels:
+                steps.passed(made, done, timer.seconds)
             self._statistics.passes += 1
-            if integrator.progress is not None:
-                tell(integrator.progress, min(1.0, done / budget.samples))
+            if request.progress is not None:
+                tell(request.progress, min(1.0, done / steps.samples))
         return True
 
     def _count(self, counts: MutationCounts, mutations: int) -> None:

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...planning.learned_file import LearnedFile
+from ...rendering.pace import Pace
 from ...util.stored_arrays import StoredArrays
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -220,7 +221,7 @@ class MetropolisRender(ChainRender):
 
     def _bootstrap_share(self, total: int) -> int:
         share = int(_BOOTSTRAP_SHARE * total)
-        if self._integrator.timeout > 0 and share > self._settings.bootstrap:
+        if self._request.is_timed and share > self._settings.bootstrap:
             share = min(share, self._timed_share())
         return min(share, _MAX_BOOTSTRAP)
 
@@ -228,13 +229,12 @@ class MetropolisRender(ChainRender):
         """The number of bootstrap samples that suits the time limit. Separate samples measure the
         speed, because the number of samples used must not depend on their values."""
         # The first stage has compiled the kernels
-        begin = time.perf_counter()
+        begin, pace = time.perf_counter(), Pace()
         seed = stream(self._seed, FIRST_STAGE)
         count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
-        # The clock may measure 0 seconds, which must not be a divisor
-        seconds = max(time.perf_counter() - begin, 1e-6)
-        left = self._integrator.timeout - (time.perf_counter() - self._start)
-        return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
+        pace.measure(count, time.perf_counter() - begin)
+        left = self._request.timeout - (time.perf_counter() - self._start)
+        return int(pace.fits(_BOOTSTRAP_TIME * left))
 
     def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count

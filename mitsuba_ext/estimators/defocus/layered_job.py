@@ -10,6 +10,7 @@ import numpy as np
 
 from ...rendering import camera
 from ...rendering.render import Job
+from ...rendering.request import Request
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays, Sample
 from ...transport.lens_view import LensView
@@ -46,16 +47,20 @@ class LayeredJob(Job):
     #: The samples are also put into layers.
     freezes_passes = False
 
-    def __init__(self, integrator, scene, sensor, seed, spp) -> None:
-        super().__init__(integrator, scene, sensor, seed, spp)
+    def __init__(self, integrator, request: Request) -> None:
+        super().__init__(integrator, request)
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
             raise NotImplementedError(
                 f'"{integrator.name}": does not work with the film "{self.film.class_name()}": '
                 f'use an "hdrfilm".'
             )
-        self.lens = integrator.thin_lens(sensor)
-        self._lens_view = LensView(scene, sensor, integrator.scene_query(scene))
-        self.view = PinholeView(self._lens_view, scene, self.lens, integrator.denoise)
+        self.lens = integrator.thin_lens(self.sensor)
+        self._lens_view = LensView(
+            self.scene, self.sensor, integrator.scene_query(self.scene)
+        )
+        self.view = PinholeView(
+            self._lens_view, self.scene, self.lens, integrator.denoise
+        )
         self.filter = FILTERS[integrator.filter]()
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
@@ -155,7 +160,7 @@ class LayeredJob(Job):
         place = lane // dr.opaque(mi.UInt32, count)
         sampler = mi.load_dict({"type": "independent"})
         # A seed that no other part of the render uses
-        seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(0x80000000 + number))[0]
+        seed = mi.sample_tea_32(mi.UInt32(self.request.seed), mi.UInt32(0x80000000 + number))[0]
         sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(lane))
         chosen = dr.gather(mi.UInt32, pixels, place)
         pixel, is_hidden = chosen & (_HIDDEN_BIT - 1), chosen >= _HIDDEN_BIT

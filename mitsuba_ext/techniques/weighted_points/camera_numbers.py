@@ -71,8 +71,8 @@ class WeightedNumbers(Technique):
 
     needs_equal_samples = 'the sets of numbers of "{slot}" belong together: leave the parameter out'
 
-    def samples_per_set(self, spp: int, is_timed: bool) -> int:
-        return samples_per_set(spp, is_timed)
+    def samples_per_set(self, spp: int) -> int:
+        return samples_per_set(spp, is_timed=True)
 
     def decision(self, setting: Setting) -> PixelSets | None:
         """The numbers of a render; ``None``, with a warning, if the image does not depend on them.

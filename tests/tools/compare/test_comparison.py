@@ -114,7 +114,7 @@ def test_integrators_that_learn_plan_for_the_time_themselves(variant, monkeypatc
         render = type(mi.load_dict({"type": kind})).render
 
         def remembered(self, *arguments, _render=render, **named):
-            calls.append((self.timeout, named["spp"]))
+            calls.append((named["timeout"], named["spp"]))
             return _render(self, *arguments, **named)
 
         monkeypatch.setattr(type(mi.load_dict({"type": kind})), "render", remembered)

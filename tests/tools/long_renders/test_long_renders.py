@@ -253,10 +253,9 @@ def test_batches_learn_once(run, scenes, tmp_path, monkeypatch):
     seen = []
     render = BatchRenderer._rendered
 
-    def watched(self, batch):
-        integrator = self.chosen.named.integrator
-        seen.append((bool(integrator.save_learned), bool(integrator.load_learned)))
-        return render(self, batch)
+    def watched(self, batch, **wishes):
+        seen.append(("save_learned" in wishes, "load_learned" in wishes))
+        return render(self, batch, **wishes)
 
     monkeypatch.setattr(BatchRenderer, "_rendered", watched)
     assert run(*command, "--spp", 48)[0] == 0

@@ -104,6 +104,7 @@ def test_the_import_may_come_before_or_after_the_variant(code):
 def test_plugins_work_in_every_variant_in_turn_and_render_there():
     _run(f"""
 import mitsuba_ext, mitsuba as mi
+from mitsuba_ext.rendering.request import Request
 kept = {{}}
 for variant in {LLVM_VARIANTS!r} * 2:
     mi.set_variant(variant)
@@ -116,8 +117,8 @@ for variant in {LLVM_VARIANTS!r} * 2:
     image = mi.render(scene, spp=4).numpy()
     assert (image > 0).all(), image
     nested = mi.load_dict({{"type": "reweighted_lens", "nested": {{"type": "pss_guided"}}}})
-    plan = nested.plan_learning(scene, scene.sensors()[0], 256)
-    assert plan.pilots, "it learns, whatever variants there were before"
+    pilots = nested.plan_learning(Request(scene, scene.sensors()[0]), 256).pilots
+    assert pilots, "it learns, whatever variants there were before"
     kept[variant] = scene  # earlier variants' objects live on
 """)
 

@@ -12,6 +12,7 @@ import pytest
 from mitsuba_ext.inputs.plugin_text import parse_plugin
 from mitsuba_ext.planning import kept_learning
 from mitsuba_ext.planning.learned_file import FORM, LearnedFile
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.util import archives
 from tests.support.stage import film, sensor, stage
 from tests.support.statistical import load, one_thread, some
@@ -75,7 +76,7 @@ def test_only_later_renders_of_the_same_scene_use_the_kept_state() -> None:
         """Whether another integrator learns, with another seed."""
         integrator = mi.load_dict({"type": "neepp", **keeping, **more})
         view = scene.sensors()[0] if sensor == 0 else sensor
-        plan = integrator.plan_learning(scene, view, spp)
+        plan = integrator.plan_learning(Request(scene, view), spp)
         integrator.render(scene, sensor, seed=5, spp=spp)
         assert integrator.statistics.learned
         assert plan.restore is None or integrator.statistics.passes == 1
@@ -152,9 +153,8 @@ def test_restored_decisions_equal_the_saved_ones(tmp_path: Path) -> None:
         "directions": {"type": "guided_directions", "always_guide": True},
         "next_event": "contribution", "shadow_test": "visibility_roulette",
     })  # fmt: skip
-    sensor = scene.sensors()[0]
-    plan = again.plan_learning(scene, sensor, 64)
-    restored = again.schedule(scene, sensor, (64,), 3, plan)
+    request = Request(scene, scene.sensors()[0], 3)
+    restored = again.schedule(request, (64,), again.plan_learning(request, 64))
     restored.next_stage()
     old, new = stages[0].decisions, restored.decisions
     for key, array in old.directions.trees.state().items():

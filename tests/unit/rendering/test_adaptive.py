@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering.pass_timer import kernel_cache_misses
 from mitsuba_ext.rendering.pixel_moments import PixelMoments
-from mitsuba_ext.rendering.render import kernel_cache_misses
 from mitsuba_ext.rendering.sample_allocation import SampleAllocation
 from tests.support.batched import film_channels
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor, stage

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.planning import verdicts
-from mitsuba_ext.rendering import pace, time_budget
+from mitsuba_ext.rendering import pace
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering.plan import Learning, RenderPlan
-from mitsuba_ext.rendering.stages import ChangedSchedule, OneStage, Stage
+from mitsuba_ext.rendering.plan import RenderPlan
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import ChangedSchedule, Learning, OneStage, Stage
 from mitsuba_ext.util.arrays import add_own, channel_mean
 from tests.support.stage import area, stage
 
@@ -48,7 +49,7 @@ class _Clock:
 
         monkeypatch.setattr(rendering.Job, "run_pass", run_on_clock)
         monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
+        monkeypatch.setattr(pace, "_SHORT_PASS", 1)
 
 
 def test_the_pilots_are_planned_for_the_samples_that_fit_into_the_time(monkeypatch):
@@ -56,9 +57,9 @@ def test_the_pilots_are_planned_for_the_samples_that_fit_into_the_time(monkeypat
     integrator = _integrator("auto_path", timeout=10.0)
     plan = integrator.plan_learning
 
-    def remembered(scene, sensor, spp, *kernels):
+    def remembered(request, spp, *kernels):
         asked.append(spp)
-        return plan(scene, sensor, spp, *kernels)
+        return plan(request, spp, *kernels)
 
     integrator.plan_learning = remembered
     integrator.render(_scene(), spp=5000)
@@ -70,7 +71,8 @@ def test_a_wrapper_measures_the_speed_as_its_nested_integrator_does():
     """Otherwise, its pilots are planned for samples that never come."""
     inner, scene = _integrator("auto_path"), _scene()
     outer = mi.load_dict({"type": "adaptive", "nested": inner})
-    own, nested = (x.pace_stage(scene, scene.sensors()[0], 5000) for x in (outer, inner))
+    request = Request(scene, scene.sensors()[0])
+    own, nested = (x.pace_stage(request, 5000) for x in (outer, inner))
     assert type(own.estimator) is type(nested.estimator)
 
 
@@ -141,6 +143,16 @@ def test_the_samples_that_measure_the_speed_are_part_of_the_image(monkeypatch):
     assert timed.mean() == pytest.approx(path.mean(), rel=0.03)
 
 
+@pytest.mark.parametrize("spp", [5, 6, 8, 24])
+def test_a_timeout_never_adds_samples(monkeypatch, spp):
+    _Clock(monkeypatch, 0.5)
+    monkeypatch.setattr(pace, "_SHORT_PASS", 5 * 256)
+    scene = _scene()
+    integrator = _integrator("auto_path", timeout=100.0)
+    integrator.render(scene, spp=spp)
+    assert integrator.statistics.spp == spp
+
+
 def test_without_a_timeout_the_plan_is_made_for_all_samples(monkeypatch):
     def never(*_):
         raise AssertionError
@@ -181,7 +193,8 @@ def test_learning_begins_only_where_there_is_time_to_compile():
     integrator, scene = _integrator("auto"), _scene()
     film = {"type": "hdrfilm", "width": 256, "height": 256}
     sensor = mi.load_dict({"type": "perspective", "film": film})
-    plans = [integrator.plan_learning(scene, sensor, 64, kernels) for kernels in (20, 8, 4)]
+    request = Request(scene, sensor)
+    plans = [integrator.plan_learning(request, 64, kernels) for kernels in (20, 8, 4)]
     assert [(bool(plan.pilots), plan.tries) for plan in plans] == [
         (True, True), (True, False), (False, False)
     ]
@@ -215,8 +228,8 @@ def test_lanes_add_to_their_own_places():
 
 def test_passes_from_which_maps_are_learned_are_short_in_large_films() -> None:
     pixels = 1920 * 1080
-    plan = RenderPlan(0, 64, (32, 32), Learning(), pixels, False, 16, 1)
+    plan = RenderPlan(64, (32, 32), Learning(), pixels, False, 16, 1)
     assert plan.pass_length(32) == 16
     assert plan.pass_length(32, 2 * pixels + 1) == 2
     assert plan.pass_length(32, pixels // 2) == 1
-    assert RenderPlan(0, 64, (32, 32), Learning(), pixels, True, 8, 1).pass_length(32, pixels) == 8
+    assert RenderPlan(64, (32, 32), Learning(), pixels, True, 8, 1).pass_length(32, pixels) == 8

@@ -12,8 +12,8 @@ import pytest
 
 from mitsuba_ext.rendering import interrupts, plan
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering.plan import Learning
-from mitsuba_ext.rendering.stages import Schedule, Stage
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import Learning, Schedule, Stage
 from mitsuba_ext.transport.estimator import Sample
 from tests.support.clock import PassClock
 from tests.support.stage import stage
@@ -75,25 +75,28 @@ class _Schedule(Schedule):
     def end_learning(self) -> None:
         pass
 
+    def finish(self, statistics) -> None:
+        pass
+
 
 class _TwoStages:
     """Two stages of constants: a pilot worth 1 and a rest worth 3."""
 
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
-        self.progress, self.is_cancelled = None, False
+        self.is_cancelled = False
         self.name, self.sample_cost, self.most_lanes = "two_stages", 1, 2**32 - 1
 
-    def plan_learning(self, scene, sensor, spp):
+    def plan_learning(self, request, spp):
         return Learning((self.pilot_spp,))
 
     def samples_per_set(self, spp):
         return 1
 
-    def pace_stage(self, scene, sensor, spp):
+    def pace_stage(self, request, spp):
         return None
 
-    def schedule(self, scene, sensor, samples, seed, learning):
+    def schedule(self, request, samples, learning):
         return _Schedule(Stage(_Constant(1.0)), Stage(_Constant(3.0), "something"))
 
     def aov_names(self):
@@ -103,13 +106,14 @@ class _TwoStages:
         return []
 
     def render(self, scene, spp, **rest):
-        return rendering.render(self, scene, 0, 0, spp, True, True).numpy()
+        request = Request(scene, scene.sensors()[0], 0, spp, timeout=self.timeout)
+        return rendering.render(self, request).numpy()
 
 
 @pytest.mark.parametrize("can_be_frozen", [False, True])
 def test_samples_of_a_stage_count_in_the_film_as_its_weight_says(scene, can_be_frozen):
     class Weighted(_TwoStages):
-        def schedule(self, scene, sensor, samples, seed, learning):
+        def schedule(self, request, samples, learning):
             first, second = (_Constant(value, can_be_frozen) for value in (1.0, 3.0))
             return _Schedule(Stage(first, weight=0.25), Stage(second))
 
@@ -128,7 +132,7 @@ def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampl
     """Samplers that hold a state for each sample are the exception."""
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
-    job = rendering.Job(_path(), scene, sensor, 0, spp)
+    job = rendering.Job(_path(), Request(scene, sensor, 0, spp))
     assert job.plan.stages == (spp,) and job.plan.pass_length(spp) == length
 
 
@@ -136,7 +140,7 @@ def test_passes_of_expensive_samples_are_shorter(scene):
     """Else a pass would last minutes, in which nothing can stop it."""
     def length(**parameters):
         integrator = mi.load_dict({"type": "reweighted_direct", **parameters})
-        job = rendering.Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
+        job = rendering.Job(integrator, Request(scene, scene.sensors()[0], 0, 1 << 20))
         return job.plan.pass_length(1 << 20)
 
     assert length(light_samples=1024) <= length(light_samples=1) / 60
@@ -151,7 +155,7 @@ def test_absurd_numbers_of_samples_are_refused(scene, name, spp):
     large = mi.load_dict({"type": "perspective",
                           "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
     with pytest.raises(ValueError, match="2097152 pixels are too many: give at most 16777216"):
-        rendering.Job(_path(), scene, large, 0, 2**30)
+        rendering.Job(_path(), Request(scene, large, 0, 2**30))
 
 
 class _Recorder:
@@ -177,7 +181,7 @@ def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scen
         "type": "perspective", "sampler": {"type": sampler},
         "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}},
     })  # fmt: skip
-    image = rendering.render(integrator, scene, sensor, 0, 4, True, True).numpy()
+    image = rendering.render(integrator, Request(scene, sensor, 0, 4)).numpy()
     expected = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
     np.testing.assert_allclose(image[..., 0], expected, rtol=1e-6)
     assert [len(p) for p in estimator.pixels] == 4 * [32, 32, 32]
@@ -204,7 +208,7 @@ def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
     integrator = _TwoStages(pilot_spp=3)
     integrator.spp = 64
-    rendering.render(integrator, scene, sensor, 0, 64, True, True)
+    rendering.render(integrator, Request(scene, sensor, 0, 64))
     expected = mi.load_dict({"type": sampler})
     expected.set_sample_count(64)
     assert integrator.statistics.spp == expected.sample_count()
@@ -219,8 +223,9 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
                                     "rfilter": {"type": "box"}}})
     monkeypatch.setattr(plan, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 8 * WIDTH * HEIGHT})
     clock = PassClock(monkeypatch)
-    integrator = _TwoStages(pilot_spp=25, timeout=timeout)
-    image = rendering.render(integrator, scene, sensor, 0, 144, True, True).numpy()
+    integrator = _TwoStages(pilot_spp=25)
+    request = Request(scene, sensor, 0, 144, timeout=timeout)
+    image = rendering.render(integrator, request).numpy()
     done = integrator.statistics.spp
     assert done == round(clock.now / 0.1)
     if timeout > 100:

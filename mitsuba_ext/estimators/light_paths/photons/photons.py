@@ -6,6 +6,7 @@ from typing import Protocol
 
 import mitsuba as mi
 
+from ....rendering.request import Request
 from ....scene.bsdfs import refuse_clear_curves
 from ....scene.media import may_have_media
 from ....transport.path_decisions import NoConnections, SceneQuery
@@ -24,7 +25,6 @@ class PathIntegrator(Protocol):
     max_depth: int
     rr_depth: int
     hide_emitters: bool
-    samples_before: int
 
     def query(self, scene: mi.Scene) -> SceneQuery:
         """How rays are intersected with the scene."""
@@ -32,8 +32,7 @@ class PathIntegrator(Protocol):
 
 def photon_mapper(
     integrator: PathIntegrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
+    request: Request,
     merging: MergingParameters,
     radius_in_media: float = 0.0,
     light_paths: float = 1.0,
@@ -47,6 +46,7 @@ def photon_mapper(
     Raises:
         NotImplementedError: A light cannot emit light paths, or light passes through a curve.
     """
+    scene, sensor = request.scene, request.sensor
     query = integrator.query(scene)
     refuse_clear_curves(scene, f'"{integrator.name}"')
     emission = light_emission(integrator.name, scene)
@@ -54,7 +54,7 @@ def photon_mapper(
     light_walk = LightWalk(
         emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
     )
-    before = round(integrator.samples_before * light_paths)
+    before = round(request.samples_before * light_paths)
     radius, ball = merging.radius_of(scene, sensor, light_walk, False, before, True), None
     if outside is not None:
         ball = merging.ball_of(scene, sensor, light_walk, before, radius_in_media)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering.request import Request
 from tests.support.hard_cases import HARD_CASES
 from tests.support.stage import film, lookat, sensor
 from tests.support.statistical import assert_same_pixels_on_average, batches
@@ -82,11 +83,11 @@ def test_a_timeout_keeps_the_samples_that_were_asked_for(side, nested):
 def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
     def points_of_sets(timeout: float) -> set[int]:
         inner = nest(("lens", "time"), timeout=3.0)
-        outer = mi.load_dict({"type": "reweighted_wavelength", "timeout": timeout, "nested": inner})
+        outer = mi.load_dict({"type": "reweighted_wavelength", "nested": inner})
         scene = white()
-        sensor = scene.sensors()[0]
-        plan = outer.plan_learning(scene, sensor, 4096)
-        stage = outer.schedule(scene, sensor, (4096,), 1, plan).next_stage()
+        request = Request(scene, scene.sensors()[0], 1, timeout=timeout)
+        plan = outer.plan_learning(request, 4096)
+        stage = outer.schedule(request, (4096,), plan).next_stage()
         return {numbers._sets.count for numbers in vars(stage.camera).values() if numbers}
 
     assert points_of_sets(9.0) == {64} and points_of_sets(-1.0) == {1024}
@@ -96,9 +97,8 @@ def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
 def test_purposes_pixels_and_sets_draw_numbers_of_their_own(variant):
     nested = nest(("lens", "time", "wavelength"), pattern="sobol")
     scene = white()
-    integrator, sensor = mi.load_dict(nested), scene.sensors()[0]
-    plan = integrator.plan_learning(scene, sensor, 16)
-    schedule = integrator.schedule(scene, sensor, (16,), 1, plan)
+    integrator, request = mi.load_dict(nested), Request(scene, scene.sensors()[0], 1)
+    schedule = integrator.schedule(request, (16,), integrator.plan_learning(request, 16))
     stage = schedule.next_stage()
     pixel = dr.arange(mi.UInt32, 1 << 15)
     sets = [numbers for numbers in vars(stage.camera).values() if numbers]

@@ -1,0 +1,45 @@
+"""What a call of ``render()`` asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+
+@dataclass(frozen=True)
+class Request:
+    """What one call of ``render()`` asks for. It is passed on as a value, so that a render changes
+    no parameter of its integrator.
+
+    Attributes:
+        scene, sensor, seed: What is rendered.
+        spp: Samples per pixel; 0 for the number of the sampler.
+        develop, evaluate: See ``mi.Integrator.render``.
+        timeout: Seconds after which to stop; 0 or less for no limit.
+        progress: Called after each pass with the fraction done; ``None`` for no calls.
+        is_batch: Whether it is one of several batches of a render. A batch is not saved in the
+            folder ``checkpoint``, and does not forget that the render was cancelled before it.
+        samples_before: Samples per pixel of the batches with smaller numbers.
+        save_learned, load_learned: Files in the place of the parameters of these names; empty for
+            the parameters.
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed: int = 0
+    spp: int = 0
+    develop: bool = True
+    evaluate: bool = True
+    timeout: float = -1.0
+    progress: Callable[[float], None] | None = None
+    is_batch: bool = False
+    samples_before: int = 0
+    save_learned: str = ""
+    load_learned: str = ""
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether a timeout can end the render before it has all samples."""
+        return self.timeout > 0

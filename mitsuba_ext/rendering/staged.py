@@ -1,0 +1,76 @@
+"""What a render needs from its integrator."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import mitsuba as mi
+
+from .request import Request
+from .stages import Learning, Schedule, Stage
+from .statistics import RenderStatistics
+
+
+class Staged(Protocol):
+    """The attributes and methods of an integrator that a render uses.
+
+    Attributes:
+        statistics: Set when a render begins.
+        is_cancelled: Whether the running render is to end after the current pass.
+    """
+
+    name: str
+    statistics: RenderStatistics
+    is_cancelled: bool
+    samples_per_pass: int
+
+    @property
+    def sample_cost(self) -> int:
+        """The approximate time of a sample, in units of the time of a path."""
+
+    @property
+    def most_lanes(self) -> int:
+        """Largest number of samples that are taken at a time, limited by memory."""
+
+    def samples_per_set(self, spp: int) -> int:
+        """The number of samples of a pixel that a timeout must not separate."""
+
+    def plan_learning(
+        self, request: Request, spp: int, kernels: float = math.inf
+    ) -> Learning:
+        """What a render of ``spp`` samples per pixel learns.
+
+        Parameters:
+            request: What is rendered.
+            kernels: How many kernels as large as that of ``path`` learning may compile.
+        """
+
+    def pace_stage(self, request: Request, spp: int) -> Stage | None:
+        """The stage with which a render with a timeout, of at most ``spp`` samples per pixel,
+        measures its speed (``pace.py``); ``None`` if the first pilot does that."""
+
+    def schedule(
+        self, request: Request, samples: tuple[int, ...], learning: Learning
+    ) -> Schedule:
+        """The schedule of a render, whose stages take ``samples`` samples per pixel (pilots, and
+        the last stage), and which learns as planned."""
+
+    def aov_names(self) -> list[str]:
+        """Channels besides colour and alpha."""
+
+    def sample_aovs(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
+    ) -> list[mi.Float]:
+        """The values of these channels for camera rays, without those that the estimator returns
+        (:attr:`Sample.aovs`)."""
+
+    def no_gradients(self) -> NotImplementedError:
+        """The exception to raise if gradients are requested."""
+
+
+def is_staged(integrator: mi.Integrator) -> bool:
+    """Whether an integrator is one of ours that render in stages: its ``render()`` accepts the
+    attributes of a :class:`Request` as named arguments."""
+    # Not `isinstance`: once another variant is selected, the module holds that variant's class
+    return hasattr(integrator, "pace_stage")
