@@ -10,6 +10,7 @@ import math
 import operator
 import time
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
 from ..startup.registry import variant_bound
+from ..util.errors import did_you_mean
 from ..util.parameters import read_parameter
 
 #: Stands for "no limit" in counts.
@@ -160,6 +162,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         sensor = camera.find_sensor(scene, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         own = {"timeout": self.timeout, "progress": self.progress}
+        known = [field.name for field in fields(Request)]
+        for key in wishes:
+            if key not in known:
+                hint = did_you_mean(key, known)
+                raise TypeError(f'"{self.name}": render() has no argument "{key}"{hint}')
         request = Request(
             scene, sensor, seed & 0xFFFFFFFF, spp, develop, evaluate, **{**own, **wishes}
         )
