@@ -19,7 +19,8 @@ SENSORS_WITH_HIDDEN_ARRAYS = frozenset({"ThinLensCamera", "OrthographicCamera"})
 
 
 class UndescribedError(Exception):
-    """An argument cannot be compared with that of an earlier call; the message names it."""
+    """An argument cannot be compared with the same argument of an earlier call. The message names
+    the argument."""
 
 
 def address(thing: mi.Object) -> int:
@@ -33,7 +34,7 @@ class CallDescription:
     Parameters:
         scene: The scene that is rendered.
         own: Addresses of its objects.
-        any_width: Are the widths of arrays left out?
+        any_width: Whether the widths of arrays are left out.
 
     Attributes:
         arrays: The arrays, and objects that hold arrays, in the order in which they were met.

@@ -1,4 +1,4 @@
-"""Connecting a vertex to points of lights."""
+"""Connecting a vertex to points on lights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _GOLDEN = 0.6180339887
 
 @dataclass
 class Connection:
-    """A point of a light, seen from a vertex.
+    """A point on a light, seen from a vertex.
 
     Attributes:
         ds: The direction towards it.
@@ -44,11 +44,11 @@ class Connection:
     choice: Any
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
 class Connector:
     """Connects vertices to lights: chooses points, traces shadow rays, and applies MIS weights.
 
-    The parameters are the decisions of the walk that take part in it, and its program.
+    The parameters are the program of the walk, and the decisions that concern connections.
     """
 
     def __init__(
@@ -71,14 +71,14 @@ class Connector:
         self._weights, self._program = weights, program
         self._next_event, self._connections = next_event, connections
         self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
-        #: Has any vertex one connection, and has any more than one?
+        #: Whether any vertex has one connection, and whether any has more than one.
         self.single = connections.first <= 1 or connections.later <= 1
         self.many = connections.first > 1 or connections.later > 1
 
     def one(
         self, place: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> Connection:
-        """The connection of vertices that have one. Its density is 0 where there is none."""
+        """The connection of vertices that have only one. Its density is 0 where there is none."""
         dimension = self._next_event.choice_dimension
         choice = None
         if dimension > 0:
@@ -164,8 +164,8 @@ class Connector:
         return None if isinstance(self._shadow_test, AlwaysTest) else sampler.next_1d()
 
     def _roulette(self, state, connection, survival_sample, si, active):
-        """Lets the shadow test's decision drop connections; the survivors weigh 1/p. Returns the
-        weight, which connections survive, and the decision's state."""
+        """Lets the shadow test drop connections; the surviving ones have the weight 1/p. Returns
+        the weight, which connections survive, and the state of the shadow test."""
         p, state = self._shadow_test.probability(
             state, connection.choice, si, connection.ds, active
         )
@@ -186,7 +186,7 @@ class Connector:
         active: mi.Bool,
         inside: Any,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
-        """:meth:`gather` for vertices that have one connection, in a scene with media."""
+        """Like :meth:`gather`, for vertices that have one connection, in a scene with media."""
         connection = self.one(place, sampler, vertex, active)
         bsdf_value, pdf = self._value(
             scattering_state, ctx, vertex, connection.ds, active
@@ -222,12 +222,15 @@ class Connector:
         active: mi.Bool,
         inside: Any,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
-        """The light that the connections of vertices with more than one add to the path, throughput
-        included; the number of connections that were considered, that of shadow rays, and the new
-        state of the shadow test."""
+        """Connects vertices that have more than one connection.
+
+        Returns:
+            The light that the connections add to the path, throughput included; the number of
+            connections that were considered, and of shadow rays; the new state of the shadow test.
+        """
         dimension = self._next_event.choice_dimension
         chosen = self._connections.begin(sampler, dimension)
-        # One number for all connections: each vertex draws the same count of random numbers
+        # One number for all connections: each vertex draws the same number of random numbers
         survival_sample = self.survival_sample(sampler)
         total, index = mi.Spectrum(0), mi.UInt32(0)
         connection_count, shadow_count = mi.UInt32(0), mi.UInt32(0)
@@ -256,7 +259,8 @@ class Connector:
 
 
 def _turned(sample: mi.Float | None, index: mi.UInt32) -> mi.Float | None:
-    """The number of connection ``index``: uniform if ``sample`` is, evenly spread over indices."""
+    """The random number of connection ``index``: uniform if ``sample`` is, and evenly spread over
+    the indices."""
     if sample is None:
         return None
     turned = dr.fma(mi.Float(index), _GOLDEN, sample)

@@ -1,4 +1,4 @@
-"""The decisions with which a render takes its samples."""
+"""The decisions that a render uses to take its samples."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class PixelNumbers(Protocol):
     def draw(
         self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
     ) -> tuple[Any, ...]:
-        """The number for sample ``index`` (among all of the render) of each pixel, and its weight
-        (or two weights). ``sampler`` is that of the sensor."""
+        """The number for sample ``index`` of each pixel (counted over the whole render), and its
+        weight (or two weights). ``sampler`` is the sensor's sampler."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class CameraSamples:
     Mitsuba.
 
     Attributes:
-        aperture: Chooses points of the aperture, in two dimensions.
+        aperture: Chooses points on the aperture, in two dimensions.
         time: Chooses times in the shutter interval.
-        wavelength: Chooses the four wavelengths u + k/4. Its draws have a second weight, for
-            radiance that all four wavelengths carry: the density of u then has the period 1/4.
+        wavelength: Chooses the four wavelengths u + k/4. Each draw has a second weight, for
+            radiance that all four wavelengths carry, where the density of u has the period 1/4.
         distance: Chooses the first distance of a path in a homogeneous medium.
     """
 
@@ -59,20 +59,21 @@ class WarpedLights(Protocol):
 
 @dataclass(frozen=True)
 class Decisions(CameraSamples):
-    """The decisions of a stage, one for each slot of an integrator. ``None`` stands for the one
-    of Mitsuba's ``path``.
+    """The decisions of a stage, one for each slot of an integrator. ``None`` stands for the
+    decision of Mitsuba's ``path``.
 
     Attributes:
-        directions: Which primary samples choose the lobe and the direction of a BSDF sample.
-        scattering: In which direction a path continues.
-        next_event: Which point of which light to connect to.
+        directions: Draws the primary samples that choose the lobe and the direction of a BSDF
+            sample.
+        scattering: Chooses the direction in which a path continues.
+        next_event: Chooses a light and the point on it to connect to.
         light_numbers: Warps the primary samples of ``next_event``.
-        roulette: With which probability a path continues.
-        connections: To how many points on lights a vertex is connected.
+        roulette: The probability with which a path continues.
+        connections: The number of points on lights to which a vertex is connected.
         mis: The MIS weights of connections and of scattering.
-        shadow_test: Whether the shadow ray of a connection is traced.
+        shadow_test: Decides whether the shadow ray of a connection is traced.
         query: How rays intersect the scene.
-        subpath_selection: Which vertices of light paths a vertex is connected to.
+        subpath_selection: Chooses the vertices of light paths to which a vertex is connected.
         light_paths: How many light paths are traced, and what is done with them (only integrators
             with light paths know its type).
     """
@@ -91,11 +92,11 @@ class Decisions(CameraSamples):
 
     @property
     def camera(self) -> CameraSamples:
-        """The sources of the numbers of camera rays alone."""
+        """Only the sources of the numbers of camera rays."""
         return CameraSamples(**{name: getattr(self, name) for name in CAMERA_SLOTS})
 
     def of_walk(self) -> dict[str, Any]:
-        """The parameters of a :class:`~mitsuba_ext.transport.walk.Walk` that these decide."""
+        """The parameters of a :class:`~mitsuba_ext.transport.walk.Walk` that these decisions set."""
         chosen = {name: getattr(self, name) for name in _WALK_SLOTS}
         if self.light_numbers is not None:
             chosen["next_event"] = self.light_numbers.around(self.next_event or EmitterSampling())

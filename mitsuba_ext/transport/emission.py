@@ -43,6 +43,6 @@ def emission(
 
 
 def can_be_hit(scene: mi.Scene) -> bool:
-    """Is there a light that a scattered ray can hit?"""
+    """Whether there is a light that a scattered ray can hit."""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     return any(not (int(e.flags()) & int(delta)) for e in scene.emitters())

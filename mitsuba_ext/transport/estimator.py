@@ -39,8 +39,8 @@ class CameraRays:
 
 @dataclass
 class Splats:
-    """Contributions to other pixels than those in which the camera rays begin: those of light paths
-    that reach the sensor. There may be more or fewer of them than camera rays.
+    """Contributions of light paths that reach the sensor. They can land in any pixel, not only
+    where a camera ray begins, and there may be more or fewer of them than camera rays.
 
     Attributes:
         value: Radiance times importance; the mean over all camera samples of a pixel's splats is
@@ -87,8 +87,9 @@ class Estimator(Protocol):
     """Estimates the radiance along camera rays.
 
     Attributes:
-        can_be_frozen: May a call be recorded as a whole (``frozen.py``)? It then reads no array on
-            the host, and makes no splats. Estimators without this attribute are not recorded.
+        can_be_frozen: Whether a call may be recorded as a whole (``frozen.py``). It then reads no
+            array on the host, and makes no splats. Estimators without this attribute are not
+            recorded.
     """
 
     def __call__(

@@ -12,15 +12,15 @@ from .estimator import CameraRays
 
 
 class Distances:
-    """Which random numbers choose the distances of flights in homogeneous media: for the first
-    flight that of the camera ray, if it has one (its density is part of the ray's weight); uniform
-    ones otherwise.
+    """Draws the random numbers that choose the distances of flights in homogeneous media. The first
+    flight uses the number of the camera ray, if it has one (its density is part of the ray's
+    weight); all others use uniform numbers.
 
     Attributes:
-        scatter: Do paths scatter in homogeneous media? If not, they pass through these, and their
+        scatter: Whether paths scatter in homogeneous media. If not, they pass through, and their
             throughput is multiplied by the transmittance.
-        exact_transmittance: Do shadow rays use the closed-form transmittance of homogeneous media?
-            ``volpath`` samples a distance in each, with more noise in the same time.
+        exact_transmittance: Whether shadow rays use the closed-form transmittance of homogeneous
+            media. ``volpath`` samples a distance in each, with more noise in the same time.
     """
 
     scatter = True
@@ -87,7 +87,7 @@ def track(
         ray, end: The ray, and the distance of the surface that it hits.
         medium, channel: The medium, and the colour whose extinction chooses distances.
         t, β: Returned where not ``active``; ``β`` is the throughput at the origin of the ray.
-        active: Does the ray begin in a medium of varying density?
+        active: Whether the ray begins in a medium of varying density.
 
     Returns:
         The distance of the first real collision, the throughput up to that (coefficient of
@@ -101,7 +101,7 @@ def track(
     while dr.hint(active, label="flight"):
         mei = medium.sample_interaction(ray, sampler.next_1d(active), channel, active)
         is_inside = active & mei.is_valid() & ~(end < mei.t)
-        # Transmittance of each colour, relative to that of the colour that chose the distance
+        # Transmittance of each colour, relative to the colour that chose the distance
         σ = mei.combined_extinction
         chosen = component(σ, channel)
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint

@@ -35,8 +35,8 @@ Rules for a frozen function:
 - An array among its arguments is a literal in all calls or in none (``dr.opaque`` makes it none).
   Dr.Jit compiles literals into kernels, until it meets another value: the first render of a scene
   would have other kernels, and its image would differ from the second one by rounding.
-- Kernels whose width is that of an argument read an array of this width directly. Dr.Jit infers the
-  width of kernels that only gather from widths seen before, which fails where these change. All
+- A kernel as wide as one of the arguments reads an array of this width directly. For a kernel that
+  only gathers, Dr.Jit infers the width from widths seen before, which fails where these change. All
   widths are therefore part of the description, except for functions declared with ``any_width``.
 """
 
@@ -113,7 +113,7 @@ class _Thread(threading.local):
 
     Attributes:
         current: The render that is running.
-        is_forbidden: Is nothing recorded in it?
+        is_forbidden: Whether nothing is recorded in it.
     """
 
     current: _Current | None = None
@@ -189,7 +189,7 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
     """Decorates a function, or a method, that is to be frozen.
 
     Parameters:
-        any_width: Are its kernels right for arguments of any width?
+        any_width: Whether its kernels are right for arguments of any width.
     """
     if function is None:
         return functools.partial(frozen, any_width=any_width)
@@ -207,8 +207,8 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
 
 
 def _is_alone() -> bool:
-    """Is this the only thread that may use Dr.Jit? Threads that have rendered may, and so may
-    threads that the user started (they are no daemons)."""
+    """Whether this is the only thread that may use Dr.Jit. Threads that have rendered may use it,
+    and so may threads that the user started (which are not daemons)."""
     others = set(threading.enumerate()) - {threading.current_thread()}
     if not _process.threads.isdisjoint(others):
         return False
@@ -263,7 +263,7 @@ def _kept(mark: SceneMark) -> _SceneRecordings:
 
 
 def _is_foreign(thing: mi.Object) -> bool:
-    """Is it written in Python, and called by kernels (samplers are arguments)?"""
+    """Whether it is written in Python and called by kernels (samplers are arguments)."""
     is_python = type(thing).__module__.partition(".")[0] != "mitsuba"
     return is_python and not isinstance(thing, (mi.Sampler, mi.Integrator))
 
@@ -278,7 +278,7 @@ def _values(parameters: mi.SceneParameters) -> tuple:
 
 
 def _holds_arrays(value: Any) -> bool:
-    # Transforms of textures are numbers, those of cameras and shapes arrays
+    # Transforms of textures are numbers; transforms of cameras and shapes are arrays
     names = getattr(type(value), "DRJIT_STRUCT", ())
     return dr.is_jit_v(value) or any(_holds_arrays(getattr(value, name)) for name in names)
 

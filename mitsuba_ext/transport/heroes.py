@@ -28,13 +28,13 @@ _EVERYTHING = 0xFFFFFFFF
 
 
 def knows_heroes(ctx: mi.BSDFContext) -> bool:
-    """Does the caller let only the hero be refracted?"""
+    """Whether the caller lets only the hero be refracted."""
     return bool(ctx.type_mask & DISPERSES) and ctx.type_mask != _EVERYTHING
 
 
 def disperses(shapes: Iterable[mi.Shape]) -> bool:
-    """May any of these shapes disperse light? ``children`` of shapes are searched too. The BSDFs of
-    an instance are not accessible, so that every instance may."""
+    """Whether any of these shapes may disperse light. ``children`` of shapes are searched too. The
+    BSDFs of an instance are not accessible, so every instance is assumed to disperse."""
     return any(
         bool(shape.bsdf() and shape.bsdf().flags() & DISPERSES)
         or shape.class_name() == "Instance"
@@ -156,8 +156,8 @@ class Heroes:
         return dr.select(any_alone | refracts, alone, value)
 
     def _refracts(self, bsdf, si, wo) -> mi.Bool:
-        """Does ``wo`` cross a dispersive interface? Its lobe does not matter: connections and BSDF
-        samples must agree, for their MIS weights to add up to one."""
+        """Whether ``wo`` crosses a dispersive interface. Its lobe does not matter: connections and
+        BSDF samples must agree, or their MIS weights would not add up to one."""
         crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
         return crosses & ((bsdf.flags() & DISPERSES) != 0)
 

@@ -16,8 +16,8 @@ _MOST_PASSED = 16
 #: The number that chooses the centre of the aperture, and of the range of wavelengths.
 _MIDDLE = 0.5
 
-#: Does a ray pass through a surface? Called with its interaction, the side on which the ray arrives
-#: (1 or -1), and a mask.
+#: Returns whether a ray passes through a surface. Called with the interaction, the side on which
+#: the ray arrives (1 or -1), and a mask.
 Passes = Callable[..., "mi.Bool"]
 
 

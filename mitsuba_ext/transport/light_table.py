@@ -100,8 +100,8 @@ class LightTable(EmitterSampling):
 
 
 def alias_rows(weights: mi.Float, rows: int, count: int) -> mi.Float:
-    """Builds the alias tables of all rows. An entry has its threshold, the cell of its alias, its
-    own probability and that of the alias; a draw reads these four with one access to memory."""
+    """Builds the alias tables of all rows. An entry holds its threshold, the cell of its alias, its
+    own probability and the alias's probability; a draw reads these four in one memory access."""
     table = dr.empty(mi.Float, 4 * rows * count)
     step = max(1, _ENTRIES_AT_ONCE // count)
     for begin in range(0, rows, step):

@@ -4,15 +4,15 @@ The walk uses one of two objects: :class:`NoMedia` adds nothing to the kernel, :
 scenes with media. It decides as Mitsuba's ``volpath`` does, and (except for shadow rays through
 homogeneous media, whose transmittance is computed) draws the same random numbers in the same order:
 
-- a path that is in a medium scatters at a sampled distance, or reaches the surface
-  (``free_flight.py``); then its vertex lies in the medium, and the phase function stands in for the
-  BSDF;
+- a path that is in a medium reaches the next surface, or scatters at a sampled distance
+  (``free_flight.py``); in the latter case, its vertex lies in the medium, and the phase function
+  takes the place of the BSDF;
 - shadow rays pass through media and index-matched surfaces (``transmittance.py``);
 - index-matched surfaces do not count as vertices: the path keeps its depth, and the density with
   which it left the last vertex.
 
-A vertex in a medium is given to all decisions as a surface interaction that has a position, but no
-shape, no BSDF (a null pointer, whose calls return zero) and no normal.
+All decisions see a vertex in a medium as a surface interaction that has a position, but no shape,
+no BSDF (a null pointer, whose calls return zero) and no normal.
 
 Sources: Mitsuba 3.9.1, ``volpath``; E. Woodcock et al., *Techniques used in the GEM code*, 1965
 (null collisions); J. Novák et al., *Monte Carlo Methods for Volumetric Light Transport Simulation*,
@@ -57,11 +57,11 @@ class NoMedia:
     """For scenes without media: everything is as in ``path``.
 
     Parameters:
-        hide_emitters: Is the environment invisible to rays that nothing has scattered yet?
+        hide_emitters: Whether the environment is invisible to rays that nothing has scattered yet.
     """
 
     exist = False
-    #: Are camera rays traced in packets, as in ``path``?
+    #: Whether camera rays are traced in packets, as in ``path``.
     coherent = True
 
     def __init__(self, hide_emitters: bool = False) -> None:
@@ -85,12 +85,12 @@ class NoMedia:
     def fly(
         self, inside, sampler, ray, si, β, active
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, MediumVertex | None]:
-        """The next vertex of a path whose ``ray`` hits ``si``: there, or in a medium on the way;
-        the throughput up to it, and its part that concerns media."""
+        """The next vertex of a path whose ``ray`` hits ``si``: at ``si``, or in a medium on the
+        way; the throughput up to the vertex; and the part of the vertex that concerns media."""
         return si, β, None
 
     def meets(self, pi: mi.PreliminaryIntersection3f, inside) -> mi.Bool:
-        """Where may a ray that was launched have one more vertex?"""
+        """Whether a ray that was launched may have one more vertex."""
         return pi.is_valid()
 
     def arriving(self, β: mi.Spectrum, vertex: Vertex) -> mi.Spectrum:
@@ -98,21 +98,22 @@ class NoMedia:
         return β
 
     def goes_on(self, vertex: Vertex, max_depth: int, active) -> tuple[mi.Bool, mi.Bool]:
-        """May a path leave ``vertex``, and may ``vertex`` be connected to lights?"""
+        """Whether a path may leave ``vertex``, and whether ``vertex`` may be connected to
+        lights."""
         goes_on = (vertex.depth + 1 < max_depth) & vertex.si.is_valid()
         return goes_on, goes_on & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def turns(self, vertex: Vertex, active) -> mi.Bool:
-        """Which of the ``active`` paths may change their direction?"""
+        """The ``active`` paths that may change their direction."""
         return active
 
     def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight):
-        """The direction sample of ``vertex`` and its weight: in a medium those of the phase
-        function, elsewhere ``bs`` and ``weight``, those of the BSDF."""
+        """The direction sample of ``vertex`` and its weight: in a medium from the phase function,
+        elsewhere ``bs`` and ``weight``, which come from the BSDF."""
         return bs, weight
 
     def scattered(self, bs, active) -> mi.Bool:
-        """Which ``active`` samples ``bs`` scatter, and do not pass index-matched surfaces?"""
+        """The ``active`` samples ``bs`` that scatter, and do not pass an index-matched surface."""
         return active
 
     def depth_behind(self, bs, depth: mi.UInt32) -> mi.UInt32:
@@ -124,11 +125,12 @@ class NoMedia:
         return path
 
     def is_within(self, depth: mi.UInt32, max_depth: int, active) -> mi.Bool:
-        """Which of the ``active`` paths may have one more vertex, at ``depth``?"""
+        """The ``active`` paths that may have one more vertex, at ``depth``."""
         return active
 
     def kept(self, bs, before: Any, after: Any) -> Any:
-        """The state of the next event decision: ``after``, at index-matched surfaces ``before``."""
+        """The state of the next event decision: ``before`` at index-matched surfaces, elsewhere
+        ``after``."""
         return after
 
     def cross(self, inside, si, d) -> Any:
@@ -136,20 +138,20 @@ class NoMedia:
         return inside
 
     def visible_emission(self, emitted, path: PathState, si, scattered) -> mi.Spectrum:
-        """The emission that a path gains from the light at ``si`` that it hits, where it has
-        ``scattered`` before, not only passed through null surfaces."""
-        # Area lights that are hidden are not met (``behind``)
+        """The emission that a path gains from the light that it hits at ``si``. ``scattered`` tells
+        whether the path has scattered before, not only passed through null surfaces."""
+        # The path does not meet hidden area lights (``behind``)
         return dr.select(si.is_valid() | scattered, emitted, 0) if self._hides else emitted
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
 class Media(NoMedia):
     """For scenes with media.
 
     Parameters:
-        hide_emitters: Are lights invisible to rays that nothing has scattered yet?
-        distances: Which random numbers choose distances.
-        has_grids: May there be media that are not homogeneous?
+        hide_emitters: Whether lights are invisible to rays that nothing has scattered yet.
+        distances: Draws the random numbers that choose distances.
+        has_grids: Whether there may be media that are not homogeneous.
     """
 
     exist = True
@@ -176,7 +178,7 @@ class Media(NoMedia):
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
         σ = component(extinction(inside.medium, ray, known), inside.channel)
-        # 1 − u > 0; no extinction gives an infinite distance
+        # 1 − u > 0; an extinction of 0 gives an infinite distance
         u, distances = self._distances.draw(inside.distances, sampler, rays, known)
         t = -dr.log(1 - u) / σ
         reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
@@ -203,7 +205,7 @@ class Media(NoMedia):
         ratio = attenuation(σ - chosen if self._distances.scatter else σ, t)
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
-        sampler.next_1d(scatters)  # `volpath` draws whether the collision is a real one
+        sampler.next_1d(scatters)  # `volpath` draws whether the collision is real
         weight = ratio * dr.select(scatters, σ_s / chosen, 1)
         β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
         # ----- Media of varying density -----
@@ -240,8 +242,8 @@ class Media(NoMedia):
         return active & ~is_matched
 
     def eval(self, vertex: Vertex, d, value, pdf, active) -> tuple[mi.Spectrum, mi.Float]:
-        """The value and the density of the direction ``d`` (in world space): in a medium those of
-        the phase function, elsewhere ``value`` and ``pdf``, those of the BSDF."""
+        """The value and the density of the direction ``d`` (in world space): in a medium from the
+        phase function, elsewhere ``value`` and ``pdf``, which come from the BSDF."""
         in_medium = vertex.medium
         active = active & in_medium.scatters
         phase_value, phase_pdf = eval_phase(in_medium.mei, d, active)
@@ -329,7 +331,7 @@ def eval_phase(
 
 
 def _passes(bs: mi.BSDFSample3f) -> mi.Bool:
-    """Where does the sample go through an index-matched surface?"""
+    """Whether the sample passes through an index-matched surface."""
     return mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
 

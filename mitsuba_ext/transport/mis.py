@@ -1,8 +1,8 @@
 """Multiple importance sampling: heuristics that weigh two techniques.
 
-A heuristic is a function of two densities: that of the technique which took the sample, and that of
-the other one. The weights of both techniques add up to one wherever one of the densities is
-positive. Where both vanish or overflow, the weight is 0.
+A heuristic is a function of two densities. The first belongs to the technique that took the sample,
+the second to the other technique. The weights of both techniques add up to one wherever one of the
+densities is positive. Where both vanish or overflow, the weight is 0.
 
 Sources: E. Veach, PhD thesis, 1997, section 9.2; H. W. Jensen et al., *Monte Carlo Ray Tracing*,
 SIGGRAPH 2003 course 44, section 5.3.

@@ -131,7 +131,7 @@ class NumberTable:
 
 @dataclass
 class StoredNumbers:
-    """Numbers from a stored vector, for replay: lane i draws those of lane i of the table.
+    """Numbers from a stored vector, for replay: lane i draws the numbers of lane i of the table.
 
     Attributes:
         table: The numbers. After the last one, all are 0: a path that asks for more than is stored

@@ -15,11 +15,11 @@ class Observer:
     """Receives the events of a walk while it is traced. Subclasses override the methods that they
     need, and scatter into arrays of their own; they return nothing and do not change the walk.
 
-    No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
+    No observer is a dataclass: Dr.Jit would treat a dataclass used in a loop as part of its state.
     """
 
-    #: May a pass that it observes be recorded (``frozen.py``)? Not if it rebinds attributes
-    #: while the pass is traced.
+    #: Whether a pass that it observes may be recorded (``frozen.py``): false if the observer
+    #: rebinds attributes while the pass is traced.
     can_be_frozen = True
 
     def camera(self, rays: CameraRays) -> None:

@@ -1,8 +1,8 @@
 """The decisions of a random walk. These base classes decide as Mitsuba's ``path`` does, and define
-the methods of their replacements. They add no code to the kernel, except for shadow rays to lights
-at infinity.
+the methods that a replacement overrides. They add no code to the kernel, except for shadow rays to
+lights at infinity.
 
-Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
+Dr.Jit's loops see only local variables. Whatever a decision changes from one bounce to the next is
 therefore a *state* that its methods take and return; its attributes are read-only during the walk.
 ``None`` is the state of a decision that remembers nothing.
 """
@@ -22,7 +22,8 @@ from .vertex import PathState, Vertex
 
 
 class DirectionSamples:
-    """Which primary samples choose the lobe and the direction of a BSDF sample: uniform ones."""
+    """The primary samples that choose the lobe and the direction of a BSDF sample. This class draws
+    uniform ones."""
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         """The state before the first bounce of paths that begin in ``pixel`` of the film."""
@@ -31,16 +32,16 @@ class DirectionSamples:
     def draw(
         self, state: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Float, mi.Point2f, mi.Float | float, Any]:
-        """The number that chooses the lobe, the two that choose the direction, the factor by which
-        the throughput is to be multiplied (1 / density of the numbers), and the new state."""
+        """The number that chooses the lobe, the two numbers that choose the direction, the factor
+        for the throughput (1 / density of the numbers), and the new state."""
         return sampler.next_1d(), sampler.next_2d(), 1.0, state
 
 
 class Scattering:
-    """In which direction a path continues: that of a BSDF sample.
+    """The direction in which a path continues. This class samples the BSDF.
 
-    Another distribution of directions can be mixed in. Then the densities that are returned must be
-    those of the mixture: they go into the MIS weights of connections.
+    A replacement can mix in another distribution of directions. It must then return the densities
+    of the mixture, because MIS weights of connections are computed from them.
     """
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
@@ -63,15 +64,17 @@ class Scattering:
             sample_1, sample_2: Uniform numbers.
 
         Returns:
-            The BSDF's value (cosine included) and the density of this decision for ``wo``; the
-            sampled direction, with its density; value / density there; the new state.
+            The BSDF's value for ``wo`` (cosine included), and the density with which this decision
+            samples ``wo``; the sampled direction, with its density; value / density of the sampled
+            direction; the new state.
         """
         return *eval_and_sample_bsdf(vertex.bsdf, ctx, vertex.si, wo, sample_1, sample_2), state
 
     def eval_pdf(
         self, state: Any, ctx: mi.BSDFContext, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """The first two results of :meth:`sample` alone; ``state`` is that before it."""
+        """The first two results of :meth:`sample` alone; ``state`` is the state before the call of
+        :meth:`sample`."""
         return eval_bsdf(vertex.bsdf, ctx, vertex.si, wo, active)
 
 
@@ -80,9 +83,9 @@ class LightNumbers:
     """The primary samples of one connection.
 
     Attributes:
-        point: Chooses the point on the light (and the light, where ``choice`` is not there).
-        choice: Chooses the light: ``None``, a number, or two, as ``choice_dimension`` of
-            :class:`EmitterSampling` says.
+        point: Chooses the point on the light (and the light, if ``choice`` is ``None``).
+        choice: Chooses the light: ``None``, one number or two, according to ``choice_dimension`` of
+            :class:`EmitterSampling`.
     """
 
     point: mi.Point2f
@@ -90,15 +93,15 @@ class LightNumbers:
 
 
 class EmitterSampling:
-    """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
-    ``sampling_weight``).
+    """Chooses a light, and the point on it to connect to. This class chooses as Mitsuba does
+    (uniformly, or by the emitters' ``sampling_weight``).
 
     At each vertex, the walk calls :meth:`visit` once, and passes its result, the *place*, to
     :meth:`sample` for each connection. What :meth:`density` needs at the next vertex is the state.
 
     Attributes:
-        choice_dimension: How many random numbers choose the light. They are drawn before those that
-            choose a point on it.
+        choice_dimension: How many random numbers choose the light. They are drawn before the
+            numbers that choose a point on it.
     """
 
     choice_dimension = 0
@@ -122,15 +125,15 @@ class EmitterSampling:
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
         """A direction sample towards a light, its radiance / pdf (visibility not tested), and the
-        choice as shadow tests and observers receive it. ``place`` is from :meth:`visit`."""
+        choice that shadow tests and observers receive. ``place`` is from :meth:`visit`."""
         ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
         return ds, weight, place
 
     def remember(
         self, place: Any, scene: mi.Scene, d: mi.Vector3f, pdf: mi.Float, active: mi.Bool
     ) -> Any:
-        """The state when the vertex of ``place`` is left in the direction ``d`` (in world space),
-        which scattering chose with the density ``pdf``."""
+        """The state of a path that leaves the vertex of ``place`` in the direction ``d`` (in world
+        space), which scattering chose with the density ``pdf``."""
         return place
 
     def density(
@@ -142,7 +145,7 @@ class EmitterSampling:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> mi.Float:
-        """The solid angle density with which :meth:`sample`, at ``ref``, gives the direction
+        """The solid angle density with which :meth:`sample`, at ``ref``, chooses the direction
         ``ds``, in which a BSDF sample has hit the light at ``si``. ``state`` is what
         :meth:`remember` returned at ``ref``."""
         return scene.pdf_emitter_direction(ref, ds, active)
@@ -162,7 +165,7 @@ class EmitterSampling:
 
 
 class NoConnections(EmitterSampling):
-    """Connects to no light: light is found by BSDF samples only."""
+    """Connects to no light: only BSDF samples find light."""
 
     def sample(self, place, scene, numbers, si, active):
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), place
@@ -175,7 +178,7 @@ class NoConnections(EmitterSampling):
 
 
 class ConnectionCount:
-    """How many points on lights a vertex is connected to: one.
+    """The number of points on lights to which a vertex is connected. Here it is one.
 
     Attributes:
         first, later: Number of connections of a path's first vertex, and of each later one. With 0,
@@ -208,7 +211,7 @@ class Weights:
     scattered rays that hit lights.
 
     Parameters:
-        heuristic: Weighs these two against each other.
+        heuristic: The MIS heuristic for these two.
     """
 
     def __init__(self, heuristic: Heuristic = power_heuristic) -> None:
@@ -250,9 +253,9 @@ class ConnectionsAlone(Weights):
 
 
 class SubpathSelection:
-    """Which vertices of other subpaths a vertex is connected to: uniformly chosen ones.
-    Replacements choose a region of surfaces first, then one of the vertices in it uniformly; the
-    methods below are called for replacements only.
+    """The vertices of other subpaths to which a vertex is connected. This class stands for a
+    uniform choice. Replacements choose a region of surfaces first, then one of the vertices in it
+    uniformly; the methods below are called for replacements only.
 
     Attributes:
         count: Number of regions; 0 where there are none.
@@ -261,7 +264,8 @@ class SubpathSelection:
     count = 0
 
     def region(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """The region of a vertex of either subpath; ``si.wi`` tells the side of the surface."""
+        """The region of a vertex of either subpath; ``si.wi`` determines the side of the
+        surface."""
         raise NotImplementedError
 
     def choose(
@@ -273,13 +277,13 @@ class SubpathSelection:
 
     def expected(self, region: mi.UInt32, chosen: mi.UInt32, active: mi.Bool) -> mi.Float:
         """For MIS weights: how often, on average, a vertex in ``region`` is connected to a given
-        vertex in the region ``chosen``, in units of the number of other subpaths: probability of
-        choosing the region / vertices of a subpath there."""
+        vertex in the region ``chosen``, multiplied by the number of other subpaths. This is the
+        probability of choosing the region / the number of vertices that a subpath has there."""
         raise NotImplementedError
 
     def by_power(self, power: mi.Float) -> SubpathSelection:
-        """The selection for given vertices of other subpaths: it chooses regions by what is there,
-        in place of what is there on average. It has no :meth:`expected`.
+        """The selection for given vertices of other subpaths: it chooses regions by the actual
+        brightness of these vertices, not by their average. It has no :meth:`expected`.
 
         Parameters:
             power: The sum of the brightness of these vertices in each region; regions without any
@@ -289,7 +293,7 @@ class SubpathSelection:
 
 
 class ShadowTest:
-    """Whether the shadow ray of a connection is traced."""
+    """Decides whether the shadow ray of a connection is traced."""
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         """The state before the first bounce."""
@@ -304,8 +308,8 @@ class ShadowTest:
         active: mi.Bool,
     ) -> tuple[mi.Float | None, Any]:
         """The probability, in (0, 1], of testing the connection from ``si`` to ``ds.p``, and the
-        new state. ``choice`` is what the next event decision returned about its choice. ``None``
-        means always, and leaves the roulette out of the kernel."""
+        new state. A probability of ``None`` means always, and leaves the roulette out of the
+        kernel. ``choice`` is what the next event decision returned about its choice."""
         raise NotImplementedError
 
 
@@ -332,13 +336,13 @@ class Roulette:
     ) -> tuple[mi.Float, Any]:
         """The probability, in (0, 1] where ``active``, with which a path leaves ``vertex`` in the
         direction that was sampled there, and the new state. ``path`` is the state of the path after
-        ``vertex``: its depth is that of the next vertex. The walk divides the throughput of paths
-        that survive by the probability."""
+        ``vertex``: its depth is the depth of the next vertex. The walk divides the throughput of
+        paths that survive by the probability."""
         return dr.minimum(unguided_throughput(path), LARGEST_PROBABILITY), state
 
 
 def unguided_throughput(path: PathState) -> mi.Float:
     """The largest component of the throughput, without its sampling weight and the scaling by
     refraction. The sampling weight says nothing about the importance of a path: it is small where
-    guided samples are dense, and 4 where a hero stands for four wavelengths."""
+    guided samples are dense, and 4 where a hero represents four wavelengths."""
     return dr.max(path.β) / path.sampling_weight * dr.square(path.η)

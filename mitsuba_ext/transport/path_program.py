@@ -1,8 +1,9 @@
-"""What an estimator does along a path besides gathering radiance: it knows the *history* of the
-path, weighs what the path finds by it, ends the path by it, and adds the light of other subpaths.
+"""What an estimator does along a path besides gathering radiance. It keeps the *history* of the
+path; from the history it computes MIS weights and the probability that the path goes on; and it
+adds the light of other subpaths.
 
-One object does all of this, since all of it reads the same history. Dr.Jit's loops see local
-variables only: the history is part of the :class:`.PathState`, and the methods return a new one.
+One object does all of this because all of it reads the same history. Dr.Jit's loops see only local
+variables: the history is therefore part of the :class:`.PathState`, and methods return a new one.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from .vertex import PathState, Vertex
 
 
 class Subpaths:
-    """Other subpaths, which bring light to the vertices of a path: light paths that another walk
-    has stored."""
+    """Subpaths that bring light to the vertices of a path: light paths that another walk has
+    stored."""
 
     def gather(
         self, scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
@@ -36,14 +37,14 @@ class Subpaths:
         path: PathState,
         active: mi.Bool,
     ) -> mi.Spectrum | float:
-        """The radiance that they add on the way of a path to the surface ``si``, throughput
-        included, where the state of the path in participating media is ``inside``."""
+        """The radiance that they add along the segment that ends at the surface ``si``, throughput
+        included. ``inside`` is the state of the path in participating media."""
         return 0.0
 
 
 class PathProgram:
-    """Follows paths for an estimator. This one is for Mitsuba's ``path``: it needs no history,
-    leaves weights and Russian roulette to the decisions of the walk, and adds no code to the
+    """Follows paths for an estimator. This program is for Mitsuba's ``path``: it needs no history,
+    leaves MIS weights and Russian roulette to the decisions of the walk, and adds no code to the
     kernel.
 
     Attributes:
@@ -61,8 +62,8 @@ class PathProgram:
         return None
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
-        """The history at the vertex ``si``; ``path`` has the one of :meth:`leave` at the last
-        vertex."""
+        """The history at the vertex ``si``. ``path`` has the history that :meth:`leave` returned at
+        the previous vertex."""
         return path.history
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
@@ -72,9 +73,9 @@ class PathProgram:
     def known(
         self, vertex: Vertex, bs: mi.BSDFSample3f, β: mi.Spectrum, history: Any, active: mi.Bool
     ) -> tuple[mi.Spectrum | None, Any]:
-        """The radiance that is known of the direction in which a path leaves ``vertex``, throughput
-        included, and the history behind it, which may exclude what is known from the rest of the
-        path. ``None`` if nothing is known anywhere.
+        """The radiance that is already known in the direction in which a path leaves ``vertex``,
+        throughput included, and the history behind it, which may exclude the known radiance from
+        the rest of the path. ``None`` if nothing is known anywhere.
 
         Parameters:
             β: The throughput in that direction.
@@ -93,10 +94,10 @@ class PathProgram:
         path: PathState,
         pdf: mi.Float,
     ) -> mi.Float:
-        """The weight of light at ``si`` that the path has hit in the direction ``ds``.
+        """The MIS weight of light at ``si`` that the path has hit in the direction ``ds``.
 
         Parameters:
-            weights: The decision of the walk, for paths that scattering and connections alone find.
+            weights: The decision of the walk, for paths that only scattering and connections find.
             pdf: The density with which connections find the light, times their number.
         """
         return weights.emission(path.arrival.pdf, pdf)
@@ -110,7 +111,7 @@ class PathProgram:
         pdf: mi.Float,
         scattering_pdf: mi.Float,
     ) -> mi.Float:
-        """The weight of a connection to the light sample ``ds``.
+        """The MIS weight of a connection to the light sample ``ds``.
 
         Parameters:
             weights: See :meth:`emission`.
@@ -120,8 +121,8 @@ class PathProgram:
         return weights.connection(ds, pdf, scattering_pdf)
 
     def worth(self, vertex: Vertex, ds: mi.DirectionSample3f) -> mi.Float | float:
-        """How much the light of a connection counts, where not all light counts the same.
-        :meth:`emission` contains this factor."""
+        """A factor for the light of a connection, for programs in which not all light counts
+        equally. :meth:`emission` contains this factor."""
         return 1.0
 
     # ---- Where paths end ----
@@ -140,15 +141,16 @@ class PathProgram:
 
         Parameters:
             roulette, state: The decision of the walk, and its state.
-            late: Where the path has reached ``rr_depth``. Where it has not, the probability counts
-                only with ``ends_early``.
+            late: Whether the path has reached ``rr_depth``. If not, the probability is used only
+                with ``ends_early``.
         """
         return roulette.survival(state, vertex, path, active)
 
 
 class EndingProgram(PathProgram):
-    """A program that may end paths before ``rr_depth``. This one does not: paths survive up to that
-    depth, and from there on with the probability of the walk's decision."""
+    """The base of programs that may end paths before ``rr_depth``. By itself it ends none: paths
+    survive up to that depth, and from there on with the probability that the walk's decision
+    gives."""
 
     ends_early = True
 

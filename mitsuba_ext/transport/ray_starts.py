@@ -44,7 +44,7 @@ class RayStarts:
 
     Parameters:
         unit: The length that takes the place of Mitsuba's 1.
-        exact: Does the offset follow rounding errors? Then ``unit`` is the size of the scene.
+        exact: Whether the offset follows rounding errors. ``unit`` is then the size of the scene.
 
     With the defaults, rays are Mitsuba's.
     """

@@ -44,7 +44,7 @@ class SceneQuery:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> mi.Bool:
-        """Is the light sample ``ds`` occluded from ``si``?"""
+        """Whether the light sample ``ds`` is occluded from ``si``."""
         ray = self.shadow_ray(scene, si, ds)
         if self.starts.exact:
             # Mitsuba tests in single precision whether a sphere occludes: the square of the

@@ -30,8 +30,8 @@ def transmittance(
         query: How rays intersect the scene.
         si, ds: The vertex, and the direction of the light.
         medium, channel: The medium in front of the vertex, and the colour that chooses distances.
-        has_grids: May there be media that are not homogeneous?
-        exact: Is the transmittance of homogeneous media computed, without random distances?
+        has_grids: Whether there may be media that are not homogeneous.
+        exact: Whether the transmittance of homogeneous media is computed without random distances.
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)

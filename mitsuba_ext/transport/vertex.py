@@ -10,13 +10,13 @@ import mitsuba as mi
 
 @dataclass
 class Arrival:
-    """How a path came to its vertex.
+    """How a path reached its vertex.
 
     Attributes:
-        ref: The vertex before; meaningless at the first one.
+        ref: The previous vertex; meaningless at the first one.
         pdf: Solid angle density, at ``ref``, of the direction that led here.
-        is_delta: Did a discrete distribution choose that direction (a mirror, or the sensor)? Then
-            no connection could have found this vertex.
+        is_delta: Whether a discrete distribution chose that direction (a mirror, or the sensor). No
+            connection could then have found this vertex.
     """
 
     ref: mi.Interaction3f
@@ -33,9 +33,9 @@ class PathState:
         η: Product of the relative indices of refraction.
         sampling_weight: The factor of ``β`` that depends on how the path was sampled, not on what
             it hit: 1 / density of guided primary samples, and 4 where only one of four wavelengths
-            is left. Russian roulette divides it out.
-        depth: Number of vertices before this one, without the sensor's.
-        arrival: How the path came to the vertex.
+            is left. Russian roulette divides by it.
+        depth: Number of vertices before this one, not counting the sensor.
+        arrival: How the path reached the vertex.
         hero_is_alone: Whether only the first of the four wavelengths is left; ``None`` where
             nothing in the scene disperses light.
         history: What the program of the walk knows of the path so far
@@ -56,8 +56,8 @@ class MediumVertex:
     """The part of a vertex that concerns participating media.
 
     Attributes:
-        scatters: Does the path scatter in a medium? Elsewhere, its vertex is on a surface.
-        mei: The interaction there, without coefficients of the medium.
+        scatters: Whether the path scatters in a medium. Elsewhere, its vertex is on a surface.
+        mei: The interaction there, without the coefficients of the medium.
     """
 
     scatters: mi.Bool
@@ -66,14 +66,14 @@ class MediumVertex:
 
 @dataclass
 class Vertex:
-    """A point of a surface or of a medium that a path has reached.
+    """A point on a surface or in a medium that a path has reached.
 
     Attributes:
         si: The interaction there. In a medium, it has neither shape nor normal.
-        bsdf: Its BSDF; null in a medium.
+        bsdf: The BSDF there; null in a medium.
         path: The state of the path that has reached the vertex.
-        pixel: Index of the film pixel in which the path begins, row by row; ``None`` if unknown.
-        medium: ``None`` where the scene has no media.
+        pixel: Index, row by row, of the film pixel in which the path begins; ``None`` if unknown.
+        medium: The part that concerns media; ``None`` if the scene has none.
     """
 
     si: mi.SurfaceInteraction3f

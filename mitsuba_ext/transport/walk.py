@@ -2,11 +2,11 @@
 
 The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
 heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
-same order, so that a render of one pass returns the same image. It differs where ``path`` loses
-light: on masks before nothing, and between surfaces that are very close (``ray_starts.py``). Where
-the scene has participating media, it is ``volpath`` (``media.py``). A technique replaces one
-decision (``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision
-costs only its own work and a default one nothing.
+same order, so a render of one pass returns the same image. It differs where ``path`` loses light:
+on masks with nothing behind them, and between surfaces that are very close (``ray_starts.py``). In
+scenes with participating media, it is ``volpath`` (``media.py``). A technique replaces one decision
+(``path_decisions.py``). Dr.Jit inlines Python while it traces, so a replaced decision costs only
+its own work, and a default one costs nothing.
 """
 
 from __future__ import annotations
@@ -47,18 +47,21 @@ class Walk:
     Parameters:
         max_depth: Longest path in segments; 1 shows emitters only, 2**32 − 1 stands for no limit.
         rr_depth: Depth at which Russian roulette begins.
-        hide_emitters: Do camera rays pass through area lights, and is the environment invisible?
-        directions: Which primary samples choose the lobe and the direction of a BSDF sample.
-        scattering: In which direction a path continues.
-        next_event: Which point of which light to connect to, and with what density.
-        connections: To how many points a vertex is connected, and which numbers choose them.
-        shadow_test: Whether the shadow ray of a connection is traced.
-        roulette: With which probability a path continues.
+        hide_emitters: Whether camera rays pass through area lights, and the environment is
+            invisible.
+        directions: Draws the primary samples that choose the lobe and the direction of a BSDF
+            sample.
+        scattering: Chooses the direction in which a path continues.
+        next_event: Chooses a light and the point on it to connect to.
+        connections: The number of points to which a vertex is connected, and the random numbers
+            that choose them.
+        shadow_test: Decides whether the shadow ray of a connection is traced.
+        roulette: The probability with which a path continues.
         query: How rays intersect the scene.
-        distance: Which random numbers choose how far a path flies in a medium.
+        distance: Draws the random numbers that choose how far a path flies in a medium.
         mis: The MIS weights of connections and of scattering.
-        program: Follows the paths for the estimator that they belong to: knows their history, which
-            decides on weights, on where they end, and on the light of other subpaths.
+        program: Follows the paths for the estimator that uses them. It keeps their history, from
+            which it computes MIS weights, where paths end, and the light of other subpaths.
         observer: Receives the events of the walk.
         replay: Propagates derivatives along the paths; ``None`` if they are traced for the first
             time.
@@ -106,7 +109,7 @@ class Walk:
             self.query, heroes, self.mis, self.program, self.observer, media, self.replay,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
-        # In media, transmittance takes random numbers, which `volpath` draws before the BSDF's
+        # In media, transmittance uses random numbers; `volpath` draws them before the BSDF's
         makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
         has_subpaths = self.program.subpaths is not None
 
@@ -114,7 +117,7 @@ class Walk:
         pixel = rays.pixel
         ray = mi.Ray3f(rays.ray)
         L = mi.Spectrum(0)                              # Radiance accumulator
-        path = PathState(                               # Throughput and how it came about
+        path = PathState(                               # Throughput, and how the path got here
             β=mi.Spectrum(1),
             η=mi.Float(1),
             sampling_weight=mi.Float(1),
@@ -272,7 +275,7 @@ class Walk:
         return Sample(L, valid, scatter_count, shadow_count, connection_count)
 
     def _visit(self, connects: bool, state, scene, si, active):
-        """What the next event decision knows of a vertex."""
+        """What the next event decision knows about a vertex."""
         return self.next_event.visit(state, scene, si, active) if connects else state
 
     def _leave(self, connects: bool, place, scene, d, pdf, active):
@@ -282,9 +285,10 @@ class Walk:
     def _connect(
         self, connector, connects: bool, is_made: bool, place, sampler, vertex, active
     ) -> Connection:
-        """The one connection of a vertex, or none, also where it ``is_made`` already."""
+        """The one connection of a vertex. It is empty if the vertex has none, or if its connection
+        ``is_made`` already."""
         if connects:
             return connector.one(place, sampler, vertex, active)
         if not is_made:
-            sampler.next_2d()  # the numbers that follow are those of `path`
+            sampler.next_2d()  # Keeps the later numbers the same as in `path`
         return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), None)

@@ -34,7 +34,7 @@ class DispersiveInterface:
             ``specular_reflectance``, ``specular_transmittance``.
 
     Attributes:
-        flags: Flags that the plugin adds to those of its components.
+        flags: Flags that the plugin adds to the flags of its components.
 
     Raises:
         RuntimeError: The medium inside is dispersive, and the variant is not spectral.

@@ -18,7 +18,7 @@ class Box:
         dr.make_opaque(self._low, self._high)
 
     def is_met(self, ray: mi.Ray3f) -> mi.Bool:
-        """May there be a hit before ``ray.maxt``?"""
+        """Whether there may be a hit before ``ray.maxt``."""
         # A zero component of the direction gives ±∞, and NaN only for an origin in the plane of a
         # side, where the box holds no surface
         inverse = dr.rcp(ray.d)

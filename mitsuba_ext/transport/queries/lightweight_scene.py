@@ -98,7 +98,7 @@ class LightweightQuery(SceneQuery):
         return occluded
 
     def is_lightweight(self, pi: mi.PreliminaryIntersection3f) -> mi.Bool:
-        """Has a ray hit a lightweight shape?"""
+        """Whether a ray has hit a lightweight shape."""
         is_mine = mi.Bool(False)
         for part in self._parts:
             is_mine |= pi.valid & (pi.shape == part.surface)
