@@ -96,7 +96,7 @@ class Decisions(CameraSamples):
         return CameraSamples(**{name: getattr(self, name) for name in CAMERA_SLOTS})
 
     def of_walk(self) -> dict[str, Any]:
-        """The parameters of a :class:`~mitsuba_ext.transport.walk.Walk` that these decisions set."""
+        """The parameters of :class:`~mitsuba_ext.transport.walk.Walk` that these decisions set."""
         chosen = {name: getattr(self, name) for name in _WALK_SLOTS}
         if self.light_numbers is not None:
             chosen["next_event"] = self.light_numbers.around(self.next_event or EmitterSampling())

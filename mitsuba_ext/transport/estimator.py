@@ -64,7 +64,7 @@ class Sample:
 
     Attributes:
         L: Radiance estimate.
-        valid: Did the path hit a surface that scattered it (or the visible environment)? It becomes
+        valid: Whether the path hit a surface that scattered it (or the visible environment). It is
             alpha. ``L`` need not be zero elsewhere: a null surface may be lit.
         scatter_count: Rays traced in directions that a BSDF chose.
         shadow_count: Shadow rays traced. Counts are arrays of any width, of which the sum matters.

@@ -27,7 +27,7 @@ class Distances:
     exact_transmittance = True
 
     def begin(self, rays: CameraRays) -> Any:
-        """The state before the first flight: has the number of the ray been used?"""
+        """The state before the first flight: whether the number of the ray has been used."""
         return None if rays.distance is None else mi.Bool(False)
 
     def draw(

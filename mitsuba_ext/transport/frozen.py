@@ -2,39 +2,39 @@
 
 Tracing a walk takes longer than running it for a few ten thousand samples: Dr.Jit traces each call
 of a BSDF once for each BSDF of the scene. ``dr.freeze`` records the kernels of a function instead.
-It handles arrays, and objects of Mitsuba that hold arrays. All else that a function depends on is
-described (:class:`CallDescription`): the classes of our objects and the values of their
+It handles arrays, and objects of Mitsuba that hold arrays. Everything else that a function depends
+on is described (:class:`CallDescription`): the classes of our objects and the values of their
 attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
 used again only where all of this is the same.
 
-Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
-with a ``batch`` of sensors, which loads a table of them whenever it is traced; and where kernels
-call plugins that are written in Python: while these are traced, they may read arrays, or free
-memory of NumPy. At that, and at such a table, Dr.Jit ends the process. A function with an argument
+Nothing is recorded in three cases: in spectral variants, whose colour tables are not arguments of
+any function; with a ``batch`` of sensors, which loads a table of them whenever it is traced; and
+where kernels call plugins that are written in Python, which may read arrays or free memory of NumPy
+while they are traced. Dr.Jit ends the process in the last two cases. A function with an argument
 that cannot be described is not frozen either: a sampler in Python, or a ``thinlens`` or an
-``orthographic`` sensor, which do not tell Dr.Jit of all their arrays. (With these, camera rays are
-traced in each pass, and what follows is recorded.) The log says why (level ``Debug``). If Dr.Jit
-cannot record a function, the render begins anew, nothing more is recorded in that scene, and the
-log says so (level ``Info``).
+``orthographic`` sensor, which do not report all their arrays to Dr.Jit. (With these, camera rays
+are traced in each pass, and what follows is recorded.) The log says why (level ``Debug``). If
+Dr.Jit cannot record a function, the render starts over, nothing more is recorded in that scene, and
+the log says so (level ``Info``).
 
-Nor is anything recorded or replayed while another thread lives that may use Dr.Jit: one that has
-rendered, or that is neither a daemon nor a timer. Functions are traced then. While Dr.Jit 1.5.0
-records or replays, it holds its own lock when it calls Python, and may wait for a thread that waits
-for that lock; it keeps the state of a replay in static variables, and releases the lock wherever
-memory is allocated; and it reads and replaces the arrays of all objects that kernels can call,
-objects of other scenes included. Processes hung, ended, or returned other images.
+Nothing is recorded or replayed, either, while another thread is alive that may use Dr.Jit: a thread
+that has rendered, or that is neither a daemon nor a timer. Functions are then traced. While Dr.Jit
+1.5.0 records or replays, it holds its own lock when it calls Python, and may wait for a thread that
+waits for that lock; it keeps the state of a replay in static variables, and releases the lock
+wherever memory is allocated; and it reads and replaces the arrays of all objects that kernels can
+call, including objects of other scenes. Processes hung, ended, or returned different images.
 
 Rules for a frozen function:
 
 - It does not assign attributes of its arguments; it changes only the contents of their arrays.
   (This is checked.)
 - Other attributes of its arguments do not change between calls either, unless the argument has a
-  method ``kernel_state``, which returns those on which kernels depend.
+  method ``kernel_state``, which returns the attributes on which kernels depend.
 - It reads no array on the host, and its results are arrays, or dataclasses, dicts, lists and tuples
   of these. (This is checked.)
-- An array among its arguments is a literal in all calls or in none (``dr.opaque`` makes it none).
-  Dr.Jit compiles literals into kernels, until it meets another value: the first render of a scene
-  would have other kernels, and its image would differ from the second one by rounding.
+- An array among its arguments is a literal in all calls or in none (``dr.opaque`` ensures that it
+  is not). Dr.Jit compiles a literal into the kernel until its value changes: the first render of a
+  scene would have other kernels, and its image would differ from the second one by rounding.
 - A kernel as wide as one of the arguments reads an array of this width directly. For a kernel that
   only gathers, Dr.Jit infers the width from widths seen before, which fails where these change. All
   widths are therefore part of the description, except for functions declared with ``any_width``.
@@ -80,8 +80,8 @@ class _SceneRecordings:
         held: Objects outside of the scene that descriptions name by their address.
         recordings: The recordings, by description.
         refused: Functions that are not frozen.
-        cannot_be_recorded: Has Dr.Jit failed to record a function? Others would fail too, when the
-            render has taken many samples already.
+        cannot_be_recorded: Whether Dr.Jit has failed to record a function. Others would fail too,
+            when the render has already taken many samples.
     """
 
     mark: SceneMark

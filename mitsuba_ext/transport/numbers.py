@@ -1,4 +1,4 @@
-"""Where the random numbers of an estimator come from, besides Mitsuba's samplers.
+"""The sources of an estimator's random numbers, besides Mitsuba's samplers.
 
 An estimator draws with ``next_1d`` and ``next_2d``. Replacements of a sampler are dataclasses, so
 that Dr.Jit's loops see and update how far they have drawn.

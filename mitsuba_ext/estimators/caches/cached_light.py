@@ -31,7 +31,7 @@ class Progress:
 
     Attributes:
         phase: Which part of the path this is (:data:`SHARP`, …).
-        length: The way from the camera to the vertex.
+        length: The length of the path from the camera to the vertex.
     """
 
     phase: mi.UInt32
@@ -40,8 +40,8 @@ class Progress:
 
 class CachedPaths(EndingProgram):
     """Weighs light as ``path`` does up to the vertex that asks the cache, and light that reaches
-    this vertex directly. The cache knows all other light. Ends a path that is over; before that, it
-    decides as ``path`` does.
+    this vertex directly. All other light comes from the cache. Ends a path in the phase that is
+    over; before that, it decides as ``path`` does.
 
     Parameters:
         max_depth: Longest path in segments.
@@ -95,7 +95,7 @@ class CachedLight(CachedPaths):
     Parameters:
         grid: Finds and interpolates records.
         max_depth: Longest path in segments.
-        finds_lights: Can a scattered ray hit a light? If not, the path is over at the cache.
+        finds_lights: Whether a scattered ray can hit a light. If not, the path ends at the cache.
     """
 
     def __init__(self, grid: RecordGrid, max_depth: int, finds_lights: bool) -> None:
@@ -144,8 +144,8 @@ class FindsPlaces(CachedPaths):
 
 
 class IndirectOnly(PathProgram):
-    """Weighs light as ``path`` does, except light that the first segment hits: that is direct light
-    of the place where the path begins. Stores how long the first segment is.
+    """Weighs light as ``path`` does, but excludes light that the first segment hits, which is
+    direct light at the place where the path begins. Stores the length of the first segment.
 
     Parameters:
         lanes: Number of paths.

@@ -1,4 +1,4 @@
-"""Which of many uncovered places get a record: no two of them close to each other."""
+"""Chooses which of many uncovered places get a record: no two of them are close to each other."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def chosen(
     reach = most
     if len(records):
         distance, nearest = cKDTree(records.p).query(places.p)
-        # Farther away than a record is valid, little is known: half of what fits between
+        # Far from all records, little is known: half of the reach that fits up to the nearest one
         reach = np.clip(np.maximum(records.reach[nearest], 0.5 * distance / accuracy), least, most)
     spacing = _SPACING * accuracy * reach
     priority = np.random.default_rng(seed).permutation(len(places))
@@ -42,7 +42,7 @@ def chosen(
 
 def _one_per_cell(places: Places, width: np.ndarray, priority: np.ndarray) -> np.ndarray:
     """The first place of each cell, by priority. Cells are as wide as the spacing of their places,
-    to a factor of two, and those of different orientation are different."""
+    up to a factor of two; places of different orientation are in different cells."""
     level = np.floor(np.log2(width)).astype(np.int64)
     cell = np.floor(places.p / (2.0**level)[:, None]).astype(np.int64)
     faces = np.round(2 * places.n).astype(np.int64)
@@ -52,8 +52,8 @@ def _one_per_cell(places: Places, width: np.ndarray, priority: np.ndarray) -> np
 
 
 def _independent(places: Places, spacing: np.ndarray, priority: np.ndarray) -> np.ndarray:
-    """A maximal set of places that are not closer to each other than ``spacing``: those whose
-    priority is highest among their neighbours, again and again (M. Luby, 1986)."""
+    """A maximal set of places that are not closer to each other than ``spacing``. Each iteration
+    takes the places whose priority is highest among their neighbours (M. Luby, 1986)."""
     alive, wins = np.ones(len(places), bool), np.zeros(len(places), bool)
     pairs = _close_pairs(places, spacing)
     while alive.any():

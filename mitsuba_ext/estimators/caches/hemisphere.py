@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Each time that outliers are cut off, the sum becomes smaller, of which they may hold a share.
+#: How often outliers are cut off. Each time, the sum becomes smaller, and thus the allowed share.
 _CUTS = 8
 
 
@@ -34,7 +34,7 @@ class Strata:
 
     @classmethod
     def about(cls, samples: int) -> Strata:
-        """About so many strata, about as wide as they are high (N = π M)."""
+        """About ``samples`` strata, about as wide as they are high (N = π M)."""
         rings = max(1, round(math.sqrt(samples / math.pi)))
         return cls(rings, max(3, round(samples / rings)))
 
@@ -66,9 +66,9 @@ class Irradiance:
 
 
 def without_outliers(radiance: np.ndarray, share: float) -> np.ndarray:
-    """The radiance, of which no stratum holds more than ``share`` of a record's irradiance; what
-    exceeds that is cut off. Paths of gather rays find some lights rarely, and then much of their
-    light at once: the record that one of them belongs to would be a bright spot.
+    """The radiance, cut off so that no stratum holds more than ``share`` of a record's irradiance.
+    Gather rays find some lights rarely, and then find much of their light at once: the record of
+    such a ray would be a bright spot.
 
     Parameters:
         radiance: [record, sector, ring, channel].
@@ -90,8 +90,8 @@ def irradiance(
     Parameters:
         radiance: What is seen through each stratum: [record, sector, ring, channel].
         distance: How far away that is: [record, sector, ring]; infinite where nothing was hit.
-        least: For each record: what is nearer counts as this far for the gradient. Nobody is going
-            to extrapolate over less, and noise is divided by this distance.
+        least: For each record, the least distance that the gradient assumes for what is seen.
+            Noise is divided by this distance, and no record is extrapolated over less.
     """
     M, N = strata.rings, strata.sectors
     # Of the type of the radiance: single precision takes half the time

@@ -81,12 +81,12 @@ class CacheRounds:
     Parameters:
         scene: The scene.
         sensor: The camera.
-        walk: A walk as camera paths take it; its decisions about lights do not matter.
+        walk: The walk of camera paths; its decisions about lights do not matter.
         gatherer: Makes the records.
-        parameters: How many of them.
+        parameters: Determine how many records there are.
         seed: Seed of the render.
-        records: Those that exist.
-        most: The most records to make.
+        records: The records that exist.
+        most: The largest number of records to make.
 
     Attributes:
         records: The records so far.
@@ -128,7 +128,7 @@ class CacheRounds:
                 return
 
     def final_grid(self) -> RecordGrid:
-        """The records, as the image uses them."""
+        """The records that the image uses."""
         return RecordGrid(self.records, _OVERLAP * self._parameters.accuracy)
 
     def _round(self, stride: int) -> Round:
@@ -174,8 +174,8 @@ class CacheRounds:
 
 def pixel_cone(scene: mi.Scene, sensor: mi.Sensor) -> tuple[float, float]:
     """The width of a pixel's rays where they leave the camera, and the angle by which they widen:
-    medians over the film. Sensors without ray differentials have pixels of a thousandth of the
-    scene."""
+    medians over the film. For sensors without ray differentials, the width of a pixel is a
+    thousandth of the scene."""
     lane = dr.arange(mi.UInt32, _PROBES**2)
     position = (mi.Point2f(lane % _PROBES, lane // _PROBES) + 0.5) / _PROBES
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
@@ -188,5 +188,5 @@ def pixel_cone(scene: mi.Scene, sensor: mi.Sensor) -> tuple[float, float]:
 
 
 def deadline(seconds: float, start: float) -> Callable[[], bool]:
-    """Is there time left? ``seconds`` of 0 or less mean no limit."""
+    """A function that returns whether time is left. ``seconds`` of 0 or less mean no limit."""
     return lambda: seconds <= 0 or time.perf_counter() - start < seconds

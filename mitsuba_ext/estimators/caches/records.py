@@ -14,8 +14,8 @@ from .hemisphere import Irradiance
 #: neighbour to neighbour.
 _NEIGHBOURS, _ROUNDS = 12, 8
 
-#: Two records disagree if they differ by so many standard errors more than the accuracy allows. A
-#: record then reaches this share of the way between them.
+#: Two records disagree if they differ by more than the accuracy allows plus this number of standard
+#: errors. A record then reaches this share of the way between them.
 _NOISE, _SHORTER = 2.0, 0.7
 
 
@@ -89,7 +89,7 @@ class Records:
         """The records from :meth:`arrays`.
 
         Raises:
-            DamagedError: They are no records of so many channels.
+            DamagedError: The arrays are not records with this number of channels.
         """
         p = arrays.take("p", "f", (None, 3), longest=3 * _MOST)
         count, least = len(p), np.finfo(np.float32).tiny
@@ -120,9 +120,9 @@ class Records:
         """The records, valid where their neighbours confirm it.
 
         - A record that predicts another one wrongly, by more than the accuracy and the noise of the
-          two, is not valid there. Distances and gradients do not tell of edges.
-        - None reaches much farther than its neighbours do: R_i ≤ R_j + |x_i − x_j|. Where one
-          record has seen a small thing nearby, others may have missed it.
+          two, is not valid there. Distances and gradients do not reveal edges.
+        - No record reaches much farther than its neighbours: R_i ≤ R_j + |x_i − x_j|. Where one
+          record has seen a small object nearby, others may have missed it.
 
         Source: J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára, *Making Radiance and Irradiance
         Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR 2006.

@@ -27,7 +27,7 @@ class BidirectionalProgram(PathProgram):
         sums: Computes the partial sums.
         emission: Gives the densities of the rays with which light paths begin.
         sensor: The sensor to which light paths are connected; ``None`` to leave out t = 1.
-        observer: Is told the competing of techniques; ``None`` if nobody asks.
+        observer: Receives the densities of competing techniques; ``None`` if they are not needed.
         subpaths: Connects camera paths to light paths, and merges them.
     """
 

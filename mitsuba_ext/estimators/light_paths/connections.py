@@ -65,8 +65,8 @@ def joining_rivals(
     factor: mi.Float | float,
     expected: mi.Float | float = 1.0,
 ) -> CompetingDensities:
-    """Those of connecting a camera path that ends in ``one`` to a light path that ends in
-    ``other``. The other parameters are those of :func:`joining_weight`, and:
+    """The densities that compete with connecting a camera path that ends in ``one`` to a light path
+    that ends in ``other``. For the parameters not listed here, see :func:`joining_weight`.
 
     Parameters:
         is_first: Whether ``one``, and whether ``other``, is the first vertex of its subpath.
@@ -96,8 +96,8 @@ class LightSubpaths(Subpaths):
         query: Intersects rays with the scene.
         connections: Number of connections of each camera path vertex.
         max_depth: Longest path in segments.
-        observer: Is told of connections to vertices that are chosen by regions.
-        techniques: Is told the contributions of connections.
+        observer: Receives the connections to vertices that are chosen by regions.
+        techniques: Receives the contributions of connections.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class LightSubpaths(Subpaths):
         chosen = self._choice.choose(numbers, vertex, active)
         active, factor = chosen.active, chosen.factor * self._share
         other = self._vertices.at(chosen.index, active)
-        # Segments of the path: those of both subpaths, and one that connects them
+        # Segments of the path: the segments of both subpaths, and one that connects them
         active &= vertex.depth + other.depth + 2 <= self._max_depth
         si, far = vertex.si, other.si
         d = far.p - si.p

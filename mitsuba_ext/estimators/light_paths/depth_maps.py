@@ -89,7 +89,7 @@ class DepthMaps:
     def is_seen(
         self, place: mi.Point3f, numbers: mi.Point2f, piece: mi.UInt32, nearest: mi.Float
     ) -> mi.Bool:
-        """Is a point seen through a point of the aperture, by the map of that piece?
+        """Whether a point is seen through a point of the aperture, according to the piece's map.
 
         Parameters:
             place: The point's place.

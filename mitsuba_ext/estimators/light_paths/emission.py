@@ -48,8 +48,8 @@ class EmittedRay:
             disk perpendicular to the ray); 1 if the light is a point.
         pdf_direction: Density of the direction per solid angle; 1 if the light has only one
             direction; see :meth:`LightEmission.densities`.
-        cosine: Between the ray and the geometric normal, not negative; 1 for lights without
-            surface.
+        cosine: The cosine between the ray and the geometric normal, not negative; 1 for lights
+            without surface.
         is_delta_position, is_delta_direction, is_infinite: The kind of light.
     """
 
@@ -80,12 +80,12 @@ class LightEmission:
         scene: A scene with at least one emitter.
 
     Attributes:
-        needs_whole_interaction (bool): Must stored vertices hold all fields of the interaction
-            (``stored_interaction.py``)?
-        not_reciprocal (mi.Bool | None): Which BSDFs are not (``light_directions.py``)?
-        has_clear_curves (bool): Does light pass through a curve (``scene/bsdfs.py``)?
+        needs_whole_interaction (bool): Whether stored vertices must hold all fields of the
+            interaction (``stored_interaction.py``).
+        not_reciprocal (mi.Bool | None): Which BSDFs are not reciprocal (``light_directions.py``).
+        has_clear_curves (bool): Whether light passes through a curve (``scene/bsdfs.py``).
         probability (numpy.ndarray): Probability of choosing each emitter; shape [emitters].
-        has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
+        has_smooth_meshes (bool): Whether a light is a mesh with interpolated normals.
         radius (mi.Float): Approximate radius of the scene.
 
     Raises:
@@ -315,8 +315,8 @@ class LightEmission:
             n: Normal of the light where the ray leaves it: :meth:`front`, or the shading normal
                 where only that is known.
             ref: A point that the light illuminates; used for lights at infinity only.
-            knows_normal: Is ``n`` always the normal of the triangle? Then the densities are those
-                of :meth:`sample` itself.
+            knows_normal: Whether ``n`` is always the normal of the triangle. The densities are then
+                exactly the densities of :meth:`sample`.
 
         Returns:
             ``probability · pdf_position`` and ``pdf_direction``, as in :class:`EmittedRay`.

@@ -8,15 +8,16 @@ import numpy as np
 from ...scene.lights.power import emitter_powers
 
 #: The fraction of light paths that choose their emitter by power; the others choose it by its
-#: ``sampling_weight``, as Mitsuba does. Each probability is thus at least half of that of either
-#: choice: a sky that sends most of its power past a room does not take all paths from a lamp in it.
+#: ``sampling_weight``, as Mitsuba does. Each emitter is thus chosen with at least half of its
+#: probability under either rule: a sky that sends most of its power past a room does not take all
+#: paths from a lamp in it.
 _BY_POWER = 0.5
 
 
 def emitter_probabilities(scene: mi.Scene, can_emit: np.ndarray) -> np.ndarray:
-    """The probability of choosing each emitter; 0 for those that are not set in ``can_emit``. An
-    emitter that a camera path can hit is chosen even if its ``sampling_weight`` is 0, since camera
-    paths that hit it count its light too."""
+    """The probability of choosing each emitter; 0 where ``can_emit`` is not set. An emitter that a
+    camera path can hit is chosen even if its ``sampling_weight`` is 0, because camera paths that
+    hit it count its light too."""
     emitters = scene.emitters()
     delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
     can_be_hit = np.array([not int(e.flags()) & delta for e in emitters])

@@ -1,5 +1,5 @@
 """Choosing points of the aperture by visibility: light paths are connected to the part of the lens
-that is not occluded according to depth maps."""
+that depth maps show to be unoccluded."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _TAPS, _WIDTH = 3, 2.0
 #: root of x⁶ = x + 1; M. Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
 _STEP = 1.1347241384015194
 
-#: Added to the number of these lookups that see the point, since so few lookups may miss it.
+#: Added to the number of these lookups that see the point, because all of them may miss it.
 _PRIOR = 0.3
 
 #: Largest distance by which the table extends beyond the film, in units of the film's size.
@@ -65,8 +65,8 @@ class VisibilityLens(UniformLens):
     The view from the middle of the lens is divided into cells: rectangles of the film, times slices
     of the inverse depth. Equal steps of the inverse depth have equal parallax. For each cell that
     holds surfaces, the table has the probabilities with which its points are connected to each
-    piece of the aperture. These are never zero, so that the estimate is unbiased even where the
-    maps are wrong.
+    piece of the aperture. These are never zero, so the estimate is unbiased even where the maps are
+    wrong.
 
     A piece of which the fraction v is visible has a probability proportional to √v. If it is chosen
     with the probability q, it contributes v / q to the second moment of the estimate. The sum of

@@ -1,4 +1,4 @@
-"""In which directions light paths leave surfaces.
+"""The directions in which light paths leave surfaces.
 
 A light path that arrives from ``a`` and leaves to ``b`` carries on with the value that a camera
 path, which arrives from ``b``, finds for light from ``a`` (``scattering.py``). Most BSDFs are
@@ -39,10 +39,10 @@ class LightDirections:
     """Samples directions in which light paths leave surfaces.
 
     Parameters:
-        not_reciprocal: :func:`~mitsuba_ext.scene.bsdfs.bsdf_table` of ``NOT_RECIPROCAL``. ``None``
-            where there are only reciprocal ones.
-        mixes: Are directions also drawn from the cosine? Not where other techniques find the light
-            that no sample of the BSDF does.
+        not_reciprocal: :func:`~mitsuba_ext.scene.bsdfs.bsdf_table` of ``NOT_RECIPROCAL``; ``None``
+            if all BSDFs are reciprocal.
+        mixes: Whether directions are also drawn from the cosine. This is not needed where other
+            techniques find the light that samples of the BSDF miss.
     """
 
     def __init__(self, not_reciprocal: mi.Bool | None, mixes: bool = True) -> None:

@@ -35,9 +35,9 @@ class LightImage:
             the camera ray in its lane (if their number differs, rays must have equal importance).
         sums: Computes MIS weights. If it is ``None``, the weights are 1.
         query: Intersects rays with the scene.
-        hides_emitters: Are area lights invisible to the sensor?
+        hides_emitters: Whether area lights are invisible to the sensor.
         least_depth: Least number of segments between the light and a vertex that is connected.
-        observer: Is told the splats.
+        observer: Receives the splats.
         light_paths: Number of light paths for each camera path.
 
     Attributes:

@@ -1,8 +1,8 @@
-"""In which participating medium a light path begins. Mitsuba's emitters do not tell.
+"""Finds the participating medium in which a light path begins. Mitsuba's emitters do not store it.
 
-The surfaces around a light tell it: of the first surface that borders on a medium, the side that a
-ray from the light meets. A light that no such surface surrounds lies in the medium outside of all
-boundaries.
+The surfaces around a light determine it: it is the medium on the near side of the first surface
+that borders on a medium and that a ray from the light meets. A light that no such surface surrounds
+lies in the medium outside of all boundaries.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def medium_at_start(
 
 def outer_medium(query: SceneQuery, scene: mi.Scene, sensor: mi.Sensor) -> mi.MediumPtr:
     """The medium outside of all boundaries: behind the last one that a ray from the sensor crosses;
-    if it crosses none, that of the sensor."""
+    if it crosses none, the sensor's medium."""
     # Not through the centre of the film, where edges may meet
     ray, _ = sensor.sample_ray(
         sensor.shutter_open(), 0.5, mi.Point2f(0.47, 0.54), mi.Point2f(0.5)

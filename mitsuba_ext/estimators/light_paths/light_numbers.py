@@ -28,8 +28,8 @@ class LightPathRays:
 
     @classmethod
     def of(cls, sampler: Numbers, rays: CameraRays, per_camera_path: float = 1.0) -> LightPathRays:
-        """So many light paths for each of the camera ``rays``. With one for each, a light path has
-        the time and the wavelengths of the ray in its lane."""
+        """``per_camera_path`` light paths for each of the camera ``rays``. With one for each, a
+        light path has the time and the wavelengths of the ray in its lane."""
         lanes = dr.width(rays.ray)
         count = max(1, round(lanes * per_camera_path))
         time, wavelengths = rays.ray.time, rays.ray.wavelengths
@@ -39,24 +39,25 @@ class LightPathRays:
         return cls(count, light_numbers(sampler, lanes, count), time, wavelengths)
 
     def emits(self, active: mi.Bool) -> mi.Bool:
-        """Which light paths are traced, where the camera rays ``active`` are."""
+        """Which light paths are traced, if the camera rays ``active`` are traced."""
         lanes = dr.width(active)
         return active if lanes in (1, self.count) else dr.full(mi.Bool, True, self.count)
 
     def by_camera_path(self, count: mi.UInt32, lanes: int) -> mi.UInt32:
-        """Counts of something on each light path, in ``lanes`` of camera paths: if there is not one
-        light path for each, the first lane has all of it."""
+        """Converts a count per light path to ``lanes`` of camera paths. If there is not one light
+        path for each lane, the first lane has the whole count."""
         if self.count == lanes:
             return count
         return dr.select(dr.arange(mi.UInt32, lanes) == 0, dr.sum(count), 0)
 
 
 def light_numbers(sampler: Numbers, lanes: int, count: int) -> Numbers:
-    """The random numbers of light paths: those of ``sampler``, which has ``lanes``. Light paths
-    draw independent numbers, whose seed comes from the sampler, if their number is another, and
-    with Mitsuba 3.9.1's ``ldsampler``. Its pairs of numbers depend on each other: some points of a
-    lamp would be combined with some directions more often than with others (up to 6 % too bright in
-    a quarter of an image). Markov chains have separate numbers for light paths (``BothEnds``).
+    """The random numbers of light paths. They come from ``sampler``, which has ``lanes``, with two
+    exceptions: if the number of light paths differs from ``lanes``, and with Mitsuba 3.9.1's
+    ``ldsampler``. Light paths then draw independent numbers, whose seed comes from the sampler. The
+    pairs of numbers of ``ldsampler`` depend on each other: some points of a lamp would be combined
+    with some directions more often than with others (up to 6 % too bright in a quarter of an
+    image). Markov chains have separate numbers for light paths (``BothEnds``).
 
     Parameters:
         count: Number of light paths.

@@ -61,7 +61,7 @@ class LightPieces:
         parameter (numpy.ndarray): For spots the cosine of the cutoff angle; for projectors the area
             of the image at distance 1; 0 for other emitters.
         axis (numpy.ndarray): The direction in which each spot and projector shines; [emitters, 3].
-        has_opposite_normals (bool): Is there a light that shines from the back of its triangles?
+        has_opposite_normals (bool): Whether a light shines from the back of its triangles.
 
     Raises:
         NotImplementedError: Light paths cannot start from one of the emitters (a shape or emitter
@@ -225,7 +225,8 @@ def _check_distortion(emitter: mi.Emitter) -> None:
     """
     Raises:
         NotImplementedError: The ``to_world`` of an emitter without surface distorts directions; or
-            it scales those of one at infinity, where Mitsuba's own values are then wrong.
+            it scales the directions of an emitter at infinity, for which Mitsuba's values are then
+            wrong.
     """
     name, scale = emitter.class_name(), 1.0
     matrix = np.array(emitter.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, :3]

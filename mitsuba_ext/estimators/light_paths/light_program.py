@@ -1,5 +1,5 @@
-"""What a light path knows of its way so far: the *history* that an estimator needs at its vertices,
-besides the throughput."""
+"""What a light path knows about itself so far: the *history* that an estimator needs at its
+vertices, besides the throughput."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredHistory:
-    """How the history of a light path is stored with its vertices. This one stores nothing.
+    """How the history of a light path is stored with its vertices. This class stores nothing.
 
     Attributes:
         word_count: Number of 32-bit words. If there are any, the first one is 0 at vertices of
             caustics (:meth:`.LightVertices.is_caustic`).
-        has_region: Whether the history tells a ``region``, which is stored too.
+        has_region: Whether the history has a ``region``, which is stored too.
     """
 
     word_count: int = 0
@@ -40,8 +40,8 @@ class StoredHistory:
 
 
 class LightProgram:
-    """Follows light paths for an estimator: owns their history, which goes from vertex to vertex.
-    This one needs none.
+    """Follows light paths for an estimator: it keeps their history from vertex to vertex. This
+    program needs none.
 
     Attributes:
         stored: How the history is stored with a vertex.
@@ -63,8 +63,8 @@ class LightProgram:
         return None
 
     def arrive(self, history: Any, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> Any:
-        """The history at the vertex ``si``; ``history`` is from :meth:`leave` at the last one, or
-        from :meth:`first`."""
+        """The history at the vertex ``si``; ``history`` is from :meth:`leave` at the previous
+        vertex, or from :meth:`first`."""
         return history
 
     def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool | bool:

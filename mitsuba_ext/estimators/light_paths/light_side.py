@@ -1,4 +1,4 @@
-"""What light paths need to know of a scene."""
+"""What light paths need to know about a scene."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def light_emission(plugin: str, scene: mi.Scene) -> LightEmission:
 
 @dataclass
 class LightSide:
-    """What bidirectional methods need at the light's end of paths.
+    """What bidirectional methods need at the light end of paths.
 
     Attributes:
         emission: Samples the emitted rays with which light paths begin.
@@ -51,7 +51,8 @@ class LightSide:
 
         Parameters:
             plugin: The plugin's name in error messages.
-            has_image: Are light paths connected to the sensor, if it and its film allow that?
+            has_image: Whether light paths are connected to the sensor, if it and its film allow
+                that.
 
         Raises:
             NotImplementedError: A light cannot emit light paths.

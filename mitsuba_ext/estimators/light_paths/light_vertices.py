@@ -29,7 +29,7 @@ class Layout:
     Attributes:
         spectrum: Words of a spectrum.
         history: How the history of the path is stored.
-        is_whole: Are all fields of the interaction stored?
+        is_whole: Whether all fields of the interaction are stored.
     """
 
     spectrum: int
@@ -126,7 +126,7 @@ class LightVertices:
     Parameters:
         store: The store that the light walk has written.
         time, wavelengths: Time and wavelengths of each path.
-        disperses: May vertices have only the hero wavelength left?
+        disperses: Whether vertices may have only the hero wavelength left.
 
     Attributes:
         count (int): Number of vertices.
@@ -197,19 +197,19 @@ class LightVertices:
         return mark & (_HERO_IS_ALONE - 1)
 
     def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Does light arrive from a delta lobe at the vertices at these places of the store?"""
+        """Whether light arrives from a delta lobe at the vertices at these places of the store."""
         word = slot * self._layout.words + self._layout.spectrum
         first = dr.gather(mi.Float, self._words, word, active)
         return (self.depth(slot, active) > 1) & (first == 0)
 
     def is_in_medium(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Do the vertices at these places of the store lie in participating media?"""
+        """Whether the vertices at these places of the store lie in participating media."""
         word = slot * self._layout.words + (self._layout.mark + 1 + SHAPE_WORD)
         shape = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
         return active & (shape == 0)
 
     def is_on_surface(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Do they lie on surfaces?"""
+        """Whether the vertices at these places of the store lie on surfaces."""
         return active & ~self.is_in_medium(slot, active)
 
     def group(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:

@@ -25,8 +25,9 @@ from .light_program import LightProgram
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .scattering import delta_correction, evaluate
 
-#: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
-#: of all paths would take more than this number of bytes.
+#: Largest number of vertices of a path that are stored in a round; most paths have fewer. And the
+#: largest number of bytes that the vertices of all paths may take: a round stores fewer if
+#: necessary.
 STRIDE, _STORE_BYTES = 4, 1 << 29
 
 #: Largest number of rounds: a path that is still alive is stuck where nothing absorbs light.
@@ -42,8 +43,8 @@ class LightPaths:
         emitted: Radiance / density of the emitted ray.
         β: Throughput up to the vertex, without emission.
         sampling_weight: See :class:`~mitsuba_ext.transport.vertex.PathState`.
-        history: What the :class:`LightProgram` knows of the way: at the first vertex, that of the
-            vertex; later, that of the direction that led to it.
+        history: What the :class:`LightProgram` knows about the path so far: at the first vertex,
+            the history at the vertex itself; later, the history behind the previous vertex.
         depth: Segments between the light and the vertex.
         hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
             light.
@@ -72,22 +73,22 @@ class LightWalk:
     It works in rounds: :meth:`begin` emits rays; each :meth:`advance` walks a limited number of
     vertices and returns them; :meth:`run` walks until all paths have ended.
 
-    A path draws 6 random numbers for the emitted ray and 4 for each bounce; in scenes with media,
-    more.
+    A path draws 6 random numbers for the emitted ray and 4 for each bounce; it draws more in scenes
+    with media.
 
     Parameters:
         emission: Samples the rays with which paths begin.
-        max_depth: Longest path from light to sensor, in segments: vertices up to the depth
-            ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
+        max_depth: Longest path from light to sensor, in segments. Vertices up to the depth
+            ``max_depth`` − 1 are stored, since one more segment leads to the sensor.
         rr_depth: Depth at which Russian roulette begins.
         program: Follows the paths for the estimator that uses their vertices.
         roulette: The Russian roulette. It is given the throughput without the light's power, since
             dim lights are already chosen rarely.
         query: Intersects rays with the scene.
-        stored_lobes: Flags of BSDFs: vertices are stored where the BSDF has one of these
-            (``None``: a smooth one). For ``program``, other vertices are as specular ones.
-        outside: The medium outside of all boundaries, in scenes with media (:func:`outer_medium`).
-            ``None`` if paths pass through media as through a vacuum.
+        stored_lobes: Flags of BSDFs. Vertices are stored where the BSDF has one of them, or, if
+            this is ``None``, a smooth lobe. ``program`` treats other vertices as specular.
+        outside: In scenes with media, the medium outside of all boundaries (:func:`outer_medium`);
+            ``None`` if paths should pass through media as if through a vacuum.
     """
 
     emission: LightEmission
@@ -116,7 +117,8 @@ class LightWalk:
         """Emits a ray in each lane, and traces it.
 
         Parameters:
-            time, wavelengths: Time and wavelengths of each path: as the camera path in its lane.
+            time, wavelengths: Time and wavelengths of each path, the same as for the camera path in
+                its lane.
             active: Lanes that emit.
         """
         paths, place = self._begin(scene, numbers, time, wavelengths, active)
@@ -135,7 +137,7 @@ class LightWalk:
             active &= self._media(scene).meets(pi, inside)
             history = self.program.first(scene, self.query, emitted, pi, active)
             width = dr.width(emitted.ray)
-            # As wide as in later rounds, and in all renders: kernels would differ
+            # The same width as in later rounds and in all renders: otherwise, kernels would differ
             ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
             paths = LightPaths(
                 ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
@@ -180,8 +182,7 @@ class LightWalk:
         take: Callable[[LightVertices], None],
     ) -> mi.UInt32:
         """Traces light paths until all have ended. ``take`` is called with the vertices of each
-        round that has any: ``STRIDE`` of a path at most. The other parameters are those of
-        :meth:`begin`.
+        round that has any: at most ``STRIDE`` per path. See :meth:`begin` for the other parameters.
 
         Returns:
             For each path, the rays traced in directions that were sampled from a BSDF.
@@ -214,7 +215,7 @@ class LightWalk:
         end = place + store.stride
         last_depth = dr.opaque(mi.UInt32, self.max_depth - 1)
         rr_depth = dr.opaque(mi.UInt32, self.rr_depth)
-        # A copy: the mask of the loop is not that of the paths
+        # A copy: the loop's mask is not the paths' mask
         active = mi.Bool(paths.active)
 
         while dr.hint(active, label="light walk"):
@@ -280,7 +281,7 @@ class LightWalk:
         return media_of(scene, False, Distances())
 
     def _launch(self, scene, numbers, emitted: EmittedRay, active) -> tuple[mi.Ray3f, Any]:
-        """An emitted ray, up to where it scatters in a medium at most, and the state there."""
+        """An emitted ray, which ends where it scatters in a medium, and the state there."""
         media = self._media(scene)
         if not media.exist:
             return emitted.ray, None
@@ -292,11 +293,11 @@ class LightWalk:
         return media.launch(inside, numbers, rays, emitted.ray, active)
 
     def _is_stored(self, media: NoMedia, vertex: Vertex, stores) -> mi.Bool:
-        """Which vertices are stored?"""
+        """Whether ``vertex`` is stored."""
         return stores | vertex.medium.scatters if media.exist else stores
 
     def _goes_on(self, media: NoMedia, vertex: Vertex, last_depth, active) -> mi.Bool:
-        """Which paths may leave a vertex?"""
+        """The ``active`` paths that may leave ``vertex``."""
         if media.exist:
             return media.goes_on(vertex, self.max_depth, active)[0]
         return active & (vertex.depth < last_depth)
@@ -316,7 +317,7 @@ class LightWalk:
         return dr.select(active, weight, 0), history, hero_count, hero_is_alone
 
     def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """Are vertices with this BSDF stored?"""
+        """Whether vertices with this BSDF are stored."""
         lobes = mi.BSDFFlags.Smooth if self.stored_lobes is None else self.stored_lobes
         return mi.has_flag(bsdf.flags(), lobes)
 

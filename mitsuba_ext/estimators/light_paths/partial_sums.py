@@ -1,5 +1,5 @@
-"""Partial sums that a subpath carries along, from which the MIS weights of complete paths are
-computed: weights over all bidirectional techniques.
+"""Partial sums that a subpath carries along. The MIS weights of complete paths, over all
+bidirectional techniques, are computed from them.
 
 Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012: the
 quantities dVCM and dVC, without merging. All ratios of densities are raised to the exponent of the
@@ -24,20 +24,21 @@ class Sums:
 
     Attributes:
         dVCM: 1 / density of the last vertex, times the number of samples of the technique that
-            connects the last two vertices. At the first vertex, instead, times the ratio of the
-            densities with which next event estimation and emission sample the point on the light.
+            connects the last two vertices. At the first vertex, the second factor is instead the
+            ratio of the densities with which next event estimation and emission sample the point on
+            the light.
         dVC: The sum over the techniques that connect earlier vertices of the subpath.
         by_camera: The two terms of dVC in which a camera path finds the whole path (s = 0 and 1),
             not raised to the exponent, from the second vertex on. ``None`` for camera paths, and if
             :class:`PartialSums` does not compute it.
         region: The region of the last vertex; ``None`` if the light path vertices for connections
             are not chosen by regions.
-        count: Likewise, the factor of ``dVCM`` where the technique that connects the last two
-            vertices is such a connection.
+        count: The factor of ``dVCM`` where the technique that connects the last two vertices is
+            such a connection; ``None`` as for ``region``.
         is_caustic: Whether the direction that led to the last vertex was sampled from a delta lobe;
             ``None`` for camera paths, and if vertices are not merged.
-        by_kind: The parts of dVC of connections (s, t ≥ 2), and of the light image (t = 1; only for
-            camera paths); ``None`` if :class:`PartialSums` does not compute it.
+        by_kind: The parts of dVC that belong to connections (s, t ≥ 2) and to the light image
+            (t = 1; only for camera paths); ``None`` if :class:`PartialSums` does not compute it.
     """
 
     dVCM: mi.Float
@@ -56,13 +57,13 @@ class Sums:
 
 @dataclass
 class CompetingDensities:
-    """How densely the other techniques find a path that one technique has found: by kind, in units
-    of the density of that technique times the number of its samples.
+    """The densities with which the other techniques find a path that one technique has found. They
+    are divided by that technique's density times the number of its samples.
 
     Attributes:
         by_camera: The densities of camera paths alone (s = 0 and 1).
-        by_kind: The sum over connections (s, t ≥ 2), and that of the light image (t = 1), raised to
-            the exponent of the MIS heuristic.
+        by_kind: The sum over connections (s, t ≥ 2), and the density of the light image (t = 1),
+            raised to the exponent of the MIS heuristic.
     """
 
     by_camera: mi.Vector2f
@@ -77,17 +78,17 @@ class PartialSums:
             camera path is connected (s, t ≥ 2). Camera paths are connected to the light (s = 1) and
             hit it (s = 0) once.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
-        splits: Are ``by_camera`` and ``by_kind`` of :class:`Sums` computed?
+        splits: Whether ``by_camera`` and ``by_kind`` of :class:`Sums` are computed.
         selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
             regions multiplies ``connections``. ``None`` if the choice is uniform.
         merging: The density of merging at a vertex, relative to the product of the densities with
-            which both subpaths sample it: π r² · number of light paths, or in proportion to that.
+            which both subpaths sample it: π r² · number of light paths, or a multiple of it.
             ``None`` if vertices are not merged.
-        merges_all: Are vertices merged wherever their BSDF is smooth? If not, only where light
-            arrives from a delta lobe.
-        light_paths: Number of light paths for each camera path: so often, on average, a light path
-            is connected to the sensor (t = 1).
-        has_clear_curves: Does light pass through a curve (``scene/bsdfs.py``)?
+        merges_all: Whether vertices are merged wherever their BSDF is smooth. If not, they are
+            merged only where light arrives from a delta lobe.
+        light_paths: Number of light paths for each camera path. It is also the number of light
+            paths, per camera path, that are connected to the sensor (t = 1).
+        has_clear_curves: Whether light passes through a curve (``scene/bsdfs.py``).
     """
 
     def __init__(
@@ -112,12 +113,13 @@ class PartialSums:
         self._has_clear_curves = has_clear_curves
 
     def cosine(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
-        """The geometric cosine of a local direction; 0 where no light path comes from there, or
-        goes there: into a curve."""
+        """The geometric cosine of a local direction; 0 for directions into a curve, from which no
+        light path comes and to which none goes."""
         return dr.select(self.is_open(si, d), geometric_cosine(si, d), 0)
 
     def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
-        """Does a local direction lead anywhere but into a curve, which is left to camera paths?"""
+        """Whether a local direction does not lead into a curve. The inside of curves is left to
+        camera paths."""
         if not self._has_clear_curves:
             return mi.Bool(True)
         kind = si.shape.shape_type()
@@ -143,9 +145,9 @@ class PartialSums:
         return sums
 
     def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
-        """For a technique that connects a subpath's last vertex to something: the sum over all
-        techniques that sample this vertex from the other side, of the ratio of their density to
-        that of the technique.
+        """For a technique that connects a subpath's last vertex to something: the sum, over all
+        techniques that sample this vertex from the other side, of their density divided by the
+        density of the technique.
 
         Parameters:
             density: Density with which the other side samples the vertex, divided by the density
@@ -163,8 +165,8 @@ class PartialSums:
     def merging_weight(
         self, light: Sums, pdf: mi.Float, camera: Sums, reverse_pdf: mi.Float
     ) -> mi.Float:
-        """The MIS weight of merging the last vertices of two subpaths. The sums over the other
-        techniques that merge (dVM in the report) are dVC / ``merging``.
+        """The MIS weight of merging the last vertices of two subpaths. The sum over the other
+        techniques that merge (dVM in the report) is dVC / ``merging``.
 
         Parameters:
             pdf: Density, per solid angle, with which the camera path goes on to the vertex of the
@@ -184,8 +186,9 @@ class PartialSums:
         reverse_pdf: mi.Float,
         is_first: tuple[mi.Bool, mi.Bool],
     ) -> CompetingDensities:
-        """Those of merging. The parameters are those of :meth:`merging_weight`; ``is_first`` tells
-        whether the light path's, and the camera path's vertex is its first one."""
+        """The densities that compete with merging. The parameters are the same as for
+        :meth:`merging_weight`; ``is_first`` tells whether the vertex of the light path, and of the
+        camera path, is the first one of its path."""
         inverse, one = dr.rcp(self.merging), mi.Float(1)
         kinds = self.by_kind(one, light, pdf, is_first[0], by_light=True)
         kinds += self.by_kind(one, camera, reverse_pdf, is_first[1], by_light=False)
@@ -196,17 +199,17 @@ class PartialSums:
     def merging_before(
         self, sums: Sums, squared_distance: mi.Float, cosine: mi.Float
     ) -> mi.Float | float:
-        """For a camera path that leaves a vertex by a delta lobe: the term of dVC there for merging
-        at the vertex before, to which light then comes from that lobe.
+        """For a camera path that leaves a vertex by a delta lobe: the term of dVC at this vertex
+        for merging at the previous vertex, where light arrives from that lobe.
 
         Parameters:
-            sums: At the vertex that is left.
-            squared_distance, cosine: Of the segment to the vertex before, and there with the
-                geometric normal.
+            sums: The sums at the vertex with the delta lobe.
+            squared_distance, cosine: The squared length of the segment to the previous vertex, and
+                the cosine there between the segment and the geometric normal.
         """
         if self.merging is None or self.merges_all:
             return 0.0
-        # dVCM is 0 if the vertex before was left by a delta lobe too
+        # dVCM is 0 if the path left the previous vertex by a delta lobe too
         ratio = self.ratio(cosine / squared_distance)
         return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * self.merging, 0)
 
@@ -222,8 +225,8 @@ class PartialSums:
         densities per area.
 
         Parameters:
-            is_first: Is ``si`` the first vertex of the subpath?
-            by_light: Is it a light path?
+            is_first: Whether ``si`` is the first vertex of the subpath.
+            by_light: Whether the subpath is a light path.
         """
         inverse = dr.rcp(dr.maximum(arrival_cosine(si), 1e-12))
         region, count = None, None
@@ -255,17 +258,18 @@ class PartialSums:
         """The sums behind a vertex, after a direction was sampled there.
 
         Parameters:
-            cosine: Between the direction and the geometric normal, not negative; behind a delta
-                lobe, :func:`cosine_of_delta`.
+            cosine: The cosine between the direction and the geometric normal, not negative; behind
+                a delta lobe, :func:`cosine_of_delta`.
             pdf, reverse_pdf: Density of the direction, and of the reverse direction through the
                 vertex, per solid angle.
-            is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.
-            is_first: Is this the first vertex of the subpath?
-            by_light: Is it a light path?
+            is_delta: Whether the direction was sampled from a delta lobe. No technique then
+                connects here.
+            is_first: Whether this is the first vertex of the subpath.
+            by_light: Whether the subpath is a light path.
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
         smooth = self.others(leaves, sums, reverse_pdf)
-        # The technique that connects the segment behind this vertex is one with s, t ≥ 2
+        # The technique that connects the segment behind this vertex has s, t ≥ 2
         dVCM = self.count * self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
         return Sums(
             dr.select(is_delta, 0, dVCM),
@@ -286,8 +290,8 @@ class PartialSums:
         is_first: mi.Bool | bool,
         by_light: bool,
     ) -> mi.Vector2f | None:
-        """The parts of :meth:`others` of connections and of the light image. The parameters are
-        those of :meth:`others` and of :meth:`arrive`. ``None`` if ``splits`` is not set."""
+        """The parts of :meth:`others` that belong to connections and to the light image; ``None``
+        if ``splits`` is not set. See :meth:`others` and :meth:`arrive` for the parameters."""
         if not self.splits:
             return None
         # What connects to the first vertex: the sensor for a camera path, a light for a light path
@@ -306,9 +310,9 @@ class PartialSums:
         self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
     ) -> mi.Vector2f | None:
         """The densities with which a camera path alone finds the whole path (s = 0 and 1), each
-        divided by that of connecting to the last vertex of the light path. The parameters are those
-        of :meth:`others`; the ratios are not raised to the exponent. ``None`` if ``splits`` is not
-        set."""
+        divided by the density of connecting to the last vertex of the light path; ``None`` if
+        ``splits`` is not set. The ratios are not raised to the exponent. See :meth:`others` for the
+        parameters."""
         if sums.by_camera is None:
             return None
         first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))
@@ -330,5 +334,5 @@ def weight(others: mi.Float) -> mi.Float:
 
 
 def arrival_cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
-    """Between the direction of arrival and the geometric normal."""
+    """The cosine between the direction of arrival and the geometric normal."""
     return dr.abs(dr.dot(si.n, si.to_world(si.wi)))

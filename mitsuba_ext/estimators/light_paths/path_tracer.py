@@ -39,15 +39,15 @@ from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
 #: weights depend on the samples. (door_ajar: 11 % less variance than with 1.)
 _VERTICES = 2.5
 
-#: The number of connections that MIS weights assume where there are none: dVCM, which holds it,
-#: must not be 0, which stands for a delta lobe.
+#: The number of connections that MIS weights assume where there are none. It is not 0 because it is
+#: a factor of dVCM, and a dVCM of 0 means a delta lobe.
 _NONE = 1e-9
 
 
 @dataclass
 class BidirectionalPathTracer:
-    """Traces a camera path and a light path in each lane; it is an :class:`Estimator`. The camera
-    path is traced by a :class:`Walk`, with any decisions.
+    """Traces a camera path and a light path in each lane; it is an :class:`Estimator`. A
+    :class:`Walk` with any decisions traces the camera path.
 
     Parameters:
         walk: Traces the camera paths.
@@ -58,16 +58,16 @@ class BidirectionalPathTracer:
         selection: Chooses the regions from which these vertices are taken. Paths of different
             wavelengths or times cannot be connected. Where these differ between lanes, the choice
             is always uniform among the vertices of the light path in the same lane.
-        observer: Is told the contributions of each technique, also by the walk.
-        is_alone: Must the sample in a lane not depend on other lanes? If so, camera paths are
-            connected to the light path in the same lane only.
-        skips_direct: Are paths of one and two segments left out?
-        radius: Within what radius vertices are merged; ``None`` if they are not.
+        observer: Receives the contributions of each technique, also from the walk.
+        is_alone: Whether the sample in a lane must not depend on other lanes. If so, a camera path
+            is connected only to the light path in its lane.
+        skips_direct: Whether paths of one and two segments are left out.
+        radius: The radius within which vertices are merged; ``None`` if they are not.
         merges_all: See :class:`PartialSums`.
         light_paths: Number of light paths for each camera path. It must be 1 where paths of
             different lanes cannot be connected (see ``selection`` and ``is_alone``).
-        most_lanes: The most lanes that it should have, for the memory of what it stores; 0 for any
-            number.
+        most_lanes: The largest number of lanes for which the memory of stored vertices suffices; 0
+            for any number.
     """
 
     walk: Walk
@@ -90,8 +90,8 @@ class BidirectionalPathTracer:
         own_lane = self.is_alone or mi.is_spectral or bool(movers(scene))
         selects = self.selection.count > 0 and self.connections > 0 and not own_lane
         selection = self.selection if selects else None
-        # Connections per vertex of a light path. A selection divides by the number of vertices
-        # itself, in ``expected``
+        # Connections per vertex of a light path. A selection itself divides by the number of
+        # vertices, in ``expected``
         count = self.connections if selection else self.connections / _VERTICES or _NONE
         observer, splits = self.observer, False
         if observer is not None:
@@ -106,7 +106,7 @@ class BidirectionalPathTracer:
         per_camera_path = light.count / lanes
         radius, merging = None, None
         if self.radius is not None:
-            # Of paths of different times or wavelengths, those of one sample of each pixel merge
+            # If times or wavelengths differ, only the paths of sample k of each pixel merge
             paths = min(lanes, self.radius.pixels) if own_lane else light.count
             radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
@@ -167,7 +167,7 @@ class BidirectionalPathTracer:
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
         sample = camera_paths(replace(walk, program=program), scene, sampler, rays, active)
-        # The first lane counts all rays that are not those of the path in a lane
+        # The first lane counts all rays that belong to no camera path
         is_first = dr.arange(mi.UInt32, lanes) == 0
         shadow_count = sample.shadow_count
         if image is not None:
@@ -185,7 +185,7 @@ class BidirectionalPathTracer:
 def camera_paths(
     walk: Walk, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
 ) -> Sample:
-    """The samples of ``walk``, whose kernels are recorded, where nobody observes what cannot be."""
+    """The samples of ``walk``. Its kernels are recorded unless its observer forbids that."""
     if not walk.observer.can_be_frozen:
         return walk(scene, sampler, rays, active)
     sample, place = _walked(walk, scene, sampler, rays, mi.Bool(active))

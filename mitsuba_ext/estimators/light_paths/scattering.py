@@ -44,7 +44,7 @@ def adjoint_value(
     to_camera: mi.Vector3f,
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """As :func:`evaluate`, but not restricted to the hero wavelength where dispersive interfaces
+    """Like :func:`evaluate`, but not restricted to the hero wavelength where dispersive interfaces
     refract."""
     value, pdf = eval_bsdf(bsdf, ctx, reversed_at(si, to_camera), si.wi, active)
     arrives, leaves = geometric_cosine(si, si.wi), geometric_cosine(si, to_camera)
@@ -54,7 +54,7 @@ def adjoint_value(
 
 def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
     """The factor of the weight of a sample from a delta lobe, drawn with the mode ``Importance``,
-    that makes the integrand that of ``path`` (Veach, PhD thesis, section 5.3.2).
+    that makes the integrand the same as in ``path`` (Veach, PhD thesis, section 5.3.2).
 
     The BSDF may have turned its frame (normal maps). Its normal follows from the directions, by
     Snell's law: it is parallel to wi + η wo.

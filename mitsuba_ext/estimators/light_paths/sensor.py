@@ -83,7 +83,7 @@ class ConnectableSensor:
 
     @staticmethod
     def can_connect(sensor: mi.Sensor) -> bool:
-        """Can points of the scene be connected to this sensor?"""
+        """Whether points of the scene can be connected to this sensor."""
         return sensor_at_rest(sensor).class_name() in _CONNECTABLE
 
     @property
@@ -137,8 +137,8 @@ def is_occluded(
     active: mi.Bool,
     hides_emitters: bool = False,
 ) -> mi.Bool:
-    """Is the connection of ``si`` to the sensor occluded? With ``hides_emitters``, area lights do
-    not occlude."""
+    """Whether the connection of ``si`` to the sensor is occluded. With ``hides_emitters``, area
+    lights do not occlude."""
     ds = dr.zeros(mi.DirectionSample3f, dr.width(si))
     ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
     if not hides_emitters:

@@ -35,9 +35,9 @@ _WORDS, _MORE_WORDS, SHAPE_WORD = 15, 14, 14
 
 
 def needs_whole_interaction(scene: mi.Scene) -> bool:
-    """May a BSDF of the scene read more than ``wi`` and ``uv``? Bump and normal maps do. BSDFs
-    written in Python may. The BSDFs of instanced shapes cannot be inspected, so that they count as
-    if they did."""
+    """Whether a BSDF of the scene may read more than ``wi`` and ``uv``. Bump and normal maps do;
+    BSDFs written in Python may. The BSDFs of instanced shapes cannot be inspected, so they are
+    assumed to do so."""
     shapes = scene.shapes()
     if movers(scene) or any(shape.class_name() == "Instance" for shape in shapes):
         return True

@@ -1,1 +1,1 @@
-"""Which techniques of light paths a scene needs, from the moments of their contributions."""
+"""Finds which light path techniques a scene needs, from the moments of their contributions."""

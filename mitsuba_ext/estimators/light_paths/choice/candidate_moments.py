@@ -18,17 +18,18 @@ class CandidateMoments:
     of the light image.
 
     Let a candidate find a path of contribution f with the densities qᵢ. With the power heuristic,
-    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 but for merging. The
-    densities contain the number of samples: with twice the connections, theirs are twice as large.
+    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 except for merging.
+    The densities contain the number of samples: with twice the number of connections, the densities
+    of connections are twice as large.
 
-    Any technique that finds the path tells the terms of hits, next event estimation, the light
-    image and merging. Of merging at different vertices, only the sum of the squared densities is
-    known: the sum of their cubes is as if one of them had all of it. Several connections often find
-    the same path (corridor: up to four, whose cubes would be overestimated by half), so that only
-    the connection which found it tells its own term.
+    Whichever technique finds the path, the terms of hits, next event estimation, the light image
+    and merging are known. For merging at different vertices, only the sum of the squared densities
+    is known: the sum of their cubes is computed as if one vertex had all of it. Several connections
+    often find the same path (corridor: up to four, whose cubes would be overestimated by half), so
+    only the connection that found the path adds its own term.
 
     Parameters:
-        candidates: The candidates. That without light paths has the techniques of ``path`` alone.
+        candidates: The candidates. The one without light paths has only the techniques of ``path``.
         pixels: Number of pixels.
         samples_per_vertex: For each number of light paths that merging candidates have, how many
             samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
@@ -66,10 +67,10 @@ class CandidateMoments:
 
         Parameters:
             brought: The contribution, with its MIS weight ``mis``.
-            competing: Densities of techniques, that which found it included.
-            pixel: Where it is.
-            count: MIS weights count so many such contributions as one sample.
-            is_joined: Did a connection of a camera path to a light path find it?
+            competing: Densities of the techniques, including the one that found the contribution.
+            pixel: The pixel of the contribution.
+            count: The number of such contributions that MIS weights count as one sample.
+            is_joined: Whether a connection of a camera path to a light path found it.
         """
         active &= brought > 0
         square = count * dr.square(brought) / mis
@@ -93,7 +94,7 @@ class CandidateMoments:
             index += 1
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sums, [candidate, pixel, 2]; and those of light and second moment by the value of
+        """The sums, [candidate, pixel, 2]; and the sums of light and second moment by the value of
         contributions, [candidate, block, bin, 2]."""
         by_value = self._by_value.numpy().reshape(self._count, self._blocks, BINS, 2)
         return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value

@@ -1,4 +1,4 @@
-"""Which techniques of bidirectional path tracing a render may use, and how often."""
+"""The techniques of bidirectional path tracing that a render may use, and how often."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Candidate:
     """A set of techniques.
 
     Attributes:
-        light_paths: Number of light paths for each camera path. With 0, there are the techniques of
-            ``path`` alone.
+        light_paths: Number of light paths for each camera path. With 0, the candidate has only the
+            techniques of ``path``.
         connections: Number of connections of each vertex of a camera path to vertices of light
-            paths (s, t ≥ 2), in units of that which the integrator has otherwise.
-        merges: Are they merged?
+            paths (s, t ≥ 2), in units of the number that the integrator has by default.
+        merges: Whether camera paths are merged with light paths.
     """
 
     light_paths: float
@@ -50,11 +50,13 @@ class Available:
     """What a render can use.
 
     Attributes:
-        has_image: Are light paths connected to the sensor?
-        connects: Are they connected to camera paths?
-        radius: Within what radius they are merged; ``None`` if they are not.
-        are_shared: Can a camera path be connected to any light path? If not, there is one for each.
-        most_lanes: The most camera paths in a pass, with one light path for each; 0 for any number.
+        has_image: Whether light paths are connected to the sensor.
+        connects: Whether light paths are connected to camera paths.
+        radius: The radius within which vertices are merged; ``None`` if they are not.
+        are_shared: Whether a camera path can be connected to any light path. If not, each camera
+            path has its own light path.
+        most_lanes: The largest number of camera paths in a pass, with one light path for each; 0
+            for any number.
     """
 
     has_image: bool

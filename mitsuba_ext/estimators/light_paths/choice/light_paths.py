@@ -40,9 +40,10 @@ from .technique_observer import TechniqueObserver
 _ENOUGH = 1 << 15
 
 
-#: Most and least samples of a sparse trial, which has at least two of each pixel of its film, and
-#: the largest share of all samples that it may have: one takes about seven times as long as one of
-#: ``path``. (Trials of all sizes kept the same techniques in twelve scenes.)
+#: The largest and the least number of samples of a sparse trial, which has at least two samples of
+#: each pixel of its film; and the largest share of all samples that it may have. A sample of a
+#: trial takes about seven times as long as one of ``path``. (Trials of all sizes kept the same
+#: techniques in twelve scenes.)
 _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 
 #: The least share of missing light that statistics report.
@@ -58,8 +59,8 @@ class LightPathChoice:
     Attributes:
         techniques: What a render uses of the techniques that it has.
         observer: Observes their contributions.
-        pixel_width: The paths are those of a film with fewer pixels, each as wide as so many of the
-            film's.
+        pixel_width: The paths belong to a film with fewer pixels; this is the width of such a pixel
+            in pixels of the real film.
     """
 
     techniques: Candidate = Candidate(1.0, merges=True)
@@ -106,7 +107,8 @@ def check_shared_rays(plugin: str, scene: mi.Scene, count: float) -> None:
 
 
 class AutoLightPaths(Technique):
-    """As many light paths, and those of their techniques, as a pilot finds to be worth the time."""
+    """Chooses the number of light paths, and their techniques, by what a pilot finds to be worth
+    the time."""
 
     name = "auto"
     slots, words = ("light_paths",), {"auto": {}}
@@ -134,8 +136,8 @@ class LightPathTrial(Trial):
     Parameters:
         film: The film of the sensor.
         spp: Samples per pixel of the render.
-        is_sparse: Is one stage of :attr:`samples` enough, whose image is not kept? If not, there
-            are pilots of all pixels.
+        is_sparse: Whether one stage of :attr:`samples` is enough, whose image is not kept. If not,
+            there are pilots of all pixels.
 
     Attributes:
         samples: A pixel for each sample, of these only.
@@ -168,8 +170,8 @@ class LightPathTrial(Trial):
 
     @property
     def chosen_variance(self) -> float:
-        """The variance of what was chosen, relative to ``path``; 0 if this cannot find some of the
-        light."""
+        """The variance of what was chosen, relative to ``path``; 0 if ``path`` cannot find some of
+        the light."""
         return float(self.predicted.long_run[self._best])
 
     @property
@@ -193,7 +195,8 @@ class LightPathTrial(Trial):
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
-        """Is a sparse trial worth its time, for a render of so many samples?"""
+        """Whether a sparse trial is worth its time, for a render with ``spp`` samples in each of
+        ``pixel_count`` pixels."""
         return _LEAST_SPARSE <= spp * pixel_count * _MOST
 
     def first_choice(self) -> LightPathChoice:
@@ -234,7 +237,7 @@ class LightPathTrial(Trial):
 
     def _of_guides(self, techniques: Candidate) -> float:
         """The efficiency that guided directions are expected to have beside light paths; 1 with
-        merging, where there are none."""
+        merging, which has no guided directions."""
         return 1.0 if techniques.merges else verdicts.beside_light_paths(self.rival.guides)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -287,15 +290,15 @@ class LightPathTrial(Trial):
             f"{kept} ({predicted.variances[index]:.2f} of the variance{measured}, "
             f"{self.costs[index]:.1f} x the time)"
         )
-        # After going back, that of ``path``
+        # After going back to ``path``, the light that ``path`` misses
         missed = predicted.missed[self._best if pays else 0]
         is_told = missed >= _MIN_REPORTED_MISSING
         return f"{text}; {missed:.1%} of the light is missing" if is_told else text
 
 
 def _trial_samples(samples: int) -> int:
-    """The samples of a sparse trial in a render of so many. There are few sizes, as kernels contain
-    that of the coarse film."""
+    """The number of samples of a sparse trial in a render with ``samples`` samples. There are only
+    a few sizes, because kernels contain the size of the coarse film."""
     count = _SPARSE
     while count > max(_LEAST_SPARSE, samples * _MOST):
         count //= 2
@@ -303,9 +306,9 @@ def _trial_samples(samples: int) -> int:
 
 
 def cost(techniques: Candidate, counts: Counts) -> float:
-    """The time of the samples of a pilot, had they only these techniques, in the units of
-    :data:`SEGMENT`. ``counts`` are those of all techniques, with one light path for each camera
-    path."""
+    """The time that the samples of a pilot would take with only these techniques, in the units of
+    :data:`SEGMENT`. ``counts`` holds the counts of all techniques, with one light path for each
+    camera path."""
     time = SEGMENT * counts.camera_rays + SHADOW * counts.tested
     if techniques.light_paths == 0:
         return time

@@ -22,7 +22,7 @@ from .candidates import Available, Candidate, candidates
 from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
 
-#: About the most blocks of pixels for which there are sums by value.
+#: The approximate largest number of blocks of pixels for which there are sums by value.
 _BLOCKS = 1 << 14
 
 
@@ -31,9 +31,10 @@ class Counts:
     """What takes time in the samples of all techniques.
 
     Attributes:
-        camera_rays, light_rays: Rays that go on with camera paths and with light paths.
+        camera_rays, light_rays: Rays that continue camera paths, and rays that continue light
+            paths.
         tested: Shadow rays to lights, of camera paths.
-        connected: Shadow rays between vertices of both paths.
+        connected: Shadow rays between vertices of camera paths and of light paths.
         looked: Vertices, and rows of cells, that were looked at for merging.
     """
 
@@ -44,7 +45,7 @@ class Counts:
     looked: int = 0
 
     def add(self, *counts: int) -> None:
-        """Adds to all of them, in their order."""
+        """Adds ``counts`` to the fields, in their order."""
         for field, count in zip(fields(self), counts):
             setattr(self, field.name, getattr(self, field.name) + count)
 
@@ -59,7 +60,7 @@ class Estimate:
             there are few samples.
         by_value: Light and second moment of one sample, by the value of contributions (see
             :func:`rare`), [candidate, block, bin, 2].
-        blocks: The film of whose pixels ``by_value`` tells: blocks of pixels.
+        blocks: The film whose pixels are the blocks of ``by_value``.
     """
 
     mean: np.ndarray
@@ -109,33 +110,33 @@ class PathMoments(TechniqueObserver):
     integral. Products of the contributions at different vertices of a camera path, and squared
     means, are estimated from camera paths alone.
 
-    The variance of another candidate is that of all techniques, plus the difference between the
-    second moments (:class:`CandidateMoments`). Where there are fewer light paths, camera paths
-    bring more of the light: their squared mean, and products of their contributions, grow as the
-    square of that.
+    The variance of another candidate is the variance of all techniques together, plus the
+    difference between the second moments (:class:`CandidateMoments`). Where there are fewer light
+    paths, camera paths bring more of the light: their squared mean, and products of their
+    contributions, grow as the square of their share.
 
     Several connections of a vertex are independent given the camera path. The mean of their
     products is the square of what one is expected to bring to that vertex. Single connections do
-    not show it; it is estimated as the squared mean of a pixel's first vertices, which is too
-    little: it leaves out later vertices, and the contrast within a pixel. (Of the true value: 0.65
-    to 0.95 in veach-bidir, many_lamps, glass_lamp, kitchen, cornell_box, rooms, and 0.1 in corridor
-    and keyhole, where products are a hundredth of the squares.)
+    not show it; it is estimated as the squared mean over a pixel's first vertices. This estimate is
+    too small because it leaves out later vertices, and the contrast within a pixel. (It is 0.65 to
+    0.95 of the true value in veach-bidir, many_lamps, glass_lamp, kitchen, cornell_box and rooms,
+    and 0.1 in corridor and keyhole, where products are a hundredth of the squares.)
 
     Source: P. Grittmann, I. Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling
     for Bidirectional Rendering Algorithms*, ACM TOG 41(4), 2022 (second moments of one set of
     techniques from samples of another).
 
-    The samples may be those of a coarse film, whose pixels are rectangles of pixels: all arrays
-    are then about these.
+    The samples may belong to a coarse film, whose pixels are rectangles of pixels: all arrays then
+    have one entry for each of these rectangles.
 
     Parameters:
         coarse: The film.
         corner: The first of its sampled pixels, on the sensor's film.
-        film_width: Sampled pixels of a row of this.
+        film_width: Number of sampled pixels in a row of the sensor's film.
         spp: Samples per pixel of the render.
 
     Attributes:
-        candidates: See :func:`candidates`. The samples are those of the second one.
+        candidates: See :func:`candidates`. The samples are taken with the second one.
         samples: Number of camera samples.
         counts: What takes time (:class:`Counts`).
     """
@@ -233,8 +234,8 @@ class PathMoments(TechniqueObserver):
 
     def _add_own(self, brought, mis, other, active) -> None:
         """Adds a contribution that ``path`` finds too, by BSDF sampling or by next event
-        estimation. ``other`` is the density of the other of these two, divided by that of the one
-        that found it."""
+        estimation. ``other`` is the density of the other technique of these two, divided by the
+        density of the one that found it."""
         active = active & (mis > 0)
         whole = brought / mis
         part = whole * power_heuristic(mi.Float(1), other)
@@ -320,11 +321,11 @@ class PathMoments(TechniqueObserver):
         n, x, x2, own_products, splats, splats2, merged, joined = self._sums
         n = np.maximum(n, 1)
         # The unbiased estimate: with few samples, the square of the sample mean is too large, by
-        # the variance of the mean. With one, the mean is that of the pixel's neighbours
+        # the variance of the mean. With one, the mean is taken over the pixel's neighbours
         alone = np.maximum(x2 - self._smooth(x) ** 2, 0)
         of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), alone)
         # Few of all light paths splat to a pixel: the sum of their squares is about their variance.
-        # So it is with merging, but some samples of a pixel find the same vertex
+        # The same holds for merging, except that some samples of a pixel find the same vertex
         shared = self._shared.get(1.0, 1.0)
         everything = of_camera + (splats2 + (shared - 1) * merged) / n
         mean = (x + splats) / n

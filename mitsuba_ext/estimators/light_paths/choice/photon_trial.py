@@ -55,7 +55,8 @@ class PhotonChoice:
     trial: PhotonTrial | None = None
 
     def estimator(self, walk: Walk, mapper: Callable[[], PhotonMapper]) -> Estimator:
-        """That of a stage: ``walk`` traces camera paths; ``mapper`` makes the one with photons."""
+        """The estimator of a stage: ``walk`` traces camera paths; ``mapper`` makes the estimator
+        with photons."""
         if self.trial is not None:
             return self.trial.estimator(walk, mapper())
         return mapper() if self.techniques == PHOTONS else walk
@@ -65,13 +66,13 @@ class PhotonTrial(Trial):
     """Compares progressive photon mapping with camera paths, which have to find all light by
     themselves. Both take samples of a coarse film that are no part of the image.
 
-    What is compared is variance times time, as by :class:`LightPathTrial`. Photons have two kinds
+    What is compared is variance times time, as in :class:`LightPathTrial`. Photons have two kinds
     of variance: the samples of a pass share photons, whose noise more samples in the pass do not
-    lower. Several passes, which have photons of their own, tell the two kinds apart.
+    reduce. Several passes, which have photons of their own, tell the two kinds apart.
 
     The sample variance of camera paths is far too small where they find light rarely. This is light
-    to which no connection leads, as from a lamp in glass; a camera path has to hit the lamp. But
-    photons find this light (:class:`HiddenLight`). Let a photon bring f / p to a pixel, where a
+    that no connection reaches, for example from a lamp in glass: a camera path has to hit the lamp.
+    But photons find this light (:class:`HiddenLight`). Let a photon bring f / p to a pixel, where a
     camera path of density q, which hits the lamp, brings f / q, about the lamp's radiance. The
     second moment of camera paths is the integral of f² / q, which (f / p) (f / q) estimates, as in
     :class:`PathMoments`. Light that no camera path finds is an error of the mean: it counts as the
@@ -84,7 +85,8 @@ class PhotonTrial(Trial):
     Attributes:
         samples: A pixel for each sample of a pass.
         rival: What photons had to beat.
-        variance, time: Those of photons, relative to ``path``, once the choice has been made.
+        variance, time: Variance and time of photons, relative to ``path``, once the choice has been
+            made.
         check: Checks the choice of camera paths; ``None`` if photons were chosen, since there are
             no pilots after that.
     """
@@ -112,19 +114,20 @@ class PhotonTrial(Trial):
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
-        """Is a trial worth its time, for a render of so many samples?"""
+        """Whether a trial is worth its time, for a render with ``spp`` samples in each of
+        ``pixel_count`` pixels."""
         return _LEAST <= spp * pixel_count
 
     @property
     def chosen_variance(self) -> float:
-        """The variance of what was chosen, relative to that of the samples before."""
+        """The variance of what was chosen, relative to the variance of the samples before."""
         if self._choice.techniques != PHOTONS:
             return 1.0
         return self.variance if self.check is None else 1 / self.check.variance
 
     def estimator(self, walk: Walk, mapper: PhotonMapper) -> TrialPasses:
-        """Takes the samples: ``walk`` those of camera paths, ``mapper`` those of photons, for the
-        whole film."""
+        """Takes the samples, for the whole film: ``walk`` takes the samples of camera paths,
+        ``mapper`` the samples of photons."""
         self._mapper = mapper
         coarse = mapper.of_coarse_film(self._coarse.pixel_width)
         light_walk = replace(coarse.light_walk, program=HiddenLightProgram())
@@ -170,8 +173,8 @@ class PhotonTrial(Trial):
         return self._choice if pays else None
 
     def reconsider(self, rival: Rival, time: float, margin: float) -> PhotonChoice | None:
-        """Photons, if camera paths with all that was learned for them have so much variance that
-        photons are better."""
+        """Photons, if they are better than camera paths with all that was learned for camera paths;
+        otherwise ``None``."""
         if self.check is None or not self.check.failed(time / self.time, 1 / margin):
             return None
         self._choice = PhotonChoice(PHOTONS)
@@ -309,8 +312,8 @@ class TrialPasses:
 
 
 def _ratio(of_photons: np.ndarray, of_path: np.ndarray) -> tuple[float, float]:
-    """The variance of photons relative to that of camera paths, which have one in each pixel; and
-    the standard error of its logarithm."""
+    """The variance of photons divided by the variance of camera paths, both given for each pixel;
+    and the standard error of its logarithm."""
     less, error = gain_of(trimmed_batches(of_photons, of_path - of_photons))
     return max(1 - less, 1e-6), error
 

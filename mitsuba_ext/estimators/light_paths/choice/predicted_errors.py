@@ -10,8 +10,8 @@ from ....planning.evidence import gain_of, trimmed_batches
 from ....planning.pixel_estimates import relative_scale
 from .path_moments import Estimate
 
-#: Light is missing if so many of its contributions are expected in all pixels of a render: one
-#: render in a thousand holds one.
+#: Light is missing if this number of its contributions, or fewer, is expected in all pixels of a
+#: render: one render in a thousand holds one.
 _LEAST = 1e-3
 
 #: The pixels that ``trimmed`` leaves out, as comparisons do.
@@ -32,14 +32,14 @@ class PredictedErrors:
         variances: The expected squared error of a render of this length. Light that a candidate
             cannot find counts as missing, by its square; so does what hardly any render finds.
         trimmed: The same, without the brightest contributions, which one pixel in a thousand holds.
-        long_run: The variance: the error of long renders. Of a candidate that cannot find some
-            light, it is infinite; if ``path`` cannot, those of all others are 0.
+        long_run: The variance: the error of long renders. It is infinite for a candidate that
+            cannot find some light; if ``path`` cannot, it is 0 for all others.
         missed: The share of the light that is missing in ``variances``.
         uncertainty: The standard error of the logarithm of ``variances``.
-        of_path: The squared error of each pixel with ``path``, for one sample: that of the render,
-            times the number of samples.
-        of_image: The mean of that over the image, relative to the squared radiance of the pixels;
-            and the same without the brightest contributions.
+        of_path: The squared error of each pixel with ``path``, for one sample: the squared error of
+            the render, times the number of samples.
+        of_image: The mean of ``of_path`` over the image, relative to the squared radiance of the
+            pixels; and the same without the brightest contributions.
     """
 
     variances: np.ndarray
@@ -52,7 +52,7 @@ class PredictedErrors:
 
     @classmethod
     def of(cls, estimate: Estimate, width: int, spp: int, pixel_count: int) -> PredictedErrors:
-        """Those of a render.
+        """The predicted errors of a render.
 
         Parameters:
             estimate: What the pilot has found.
@@ -79,7 +79,7 @@ class PredictedErrors:
 def _relative_to_all(
     squared_errors: list[np.ndarray], scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each candidate, the relative squared error in units of that of all techniques, and the
+    """The relative squared error of each candidate, divided by the one with all techniques; and the
     standard error of the logarithm of this ratio."""
     weight = scale**2
     everything = squared_errors[1] * weight

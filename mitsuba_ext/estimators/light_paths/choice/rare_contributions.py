@@ -46,8 +46,8 @@ class Rare(NamedTuple):
 def rare(
     found: np.ndarray, scale: np.ndarray, width: int, spp: float, shares: Sequence[float]
 ) -> list[Rare]:
-    """The brightest contributions, as many as fewer than each of ``shares`` of all pixels hold in a
-    render. They are bright in relation to their pixel.
+    """For each of ``shares``: the brightest contributions, relative to their pixel. The number of
+    them that a render is expected to find is at most this share of the number of pixels.
 
     Parameters:
         found: Light and second moment of each sample, for each bin of values, shape [pixel, bin,
@@ -60,7 +60,7 @@ def rare(
     index = np.flatnonzero(found[..., 0] != 0)  # several times as fast as ``nonzero``
     place, value_bin = np.divmod(index, BINS)
     light, moment = found.reshape(-1, 2)[index].T.astype(np.float64)
-    # Of the value 0 are products that are too small for a float
+    # Values of 0 are products that are too small for a float
     value = np.where(value_bin == BINS - 1, np.inf, np.maximum(moment / light, 1e-30))
     # The expected number of contributions of a bin, in a pixel of the render
     number, relative = spp * light / value, value * scale[place]
@@ -80,8 +80,8 @@ def rare(
 
 
 def _brightest(value: np.ndarray, number: np.ndarray, most: float) -> np.ndarray:
-    """The places of all values that are among the largest ones, of which there are ``most``, and of
-    some more: to sort all values takes long."""
+    """The places of the largest values, up to a total of ``most`` contributions, and of some more:
+    sorting all values would take long."""
     exponent = np.clip(np.log2(value), -_MOST_EXPONENT, _MOST_EXPONENT)
     level = (_MOST_EXPONENT - exponent).astype(np.int64)
     last = np.searchsorted(np.cumsum(np.bincount(level, number)), most, side="right")
@@ -93,7 +93,7 @@ def error_of_render(variance: np.ndarray, mean: np.ndarray, rare: Rare, spp: flo
     number of its samples.
 
     Parameters:
-        variance, mean: Those of one sample of each pixel.
+        variance, mean: Variance and mean of one sample of each pixel.
         rare: What the render lacks.
         spp: Samples per pixel of the render.
     """

@@ -1,4 +1,4 @@
-"""Observers that are told the contributions of each technique of bidirectional path tracing."""
+"""Observers that receive the contributions of each technique of bidirectional path tracing."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .candidates import Available
 
 
 class TechniqueObserver(Observer):
-    """Is told the contributions of each technique. The walk reports the contributions of camera
-    paths alone (s = 0 and 1) by the methods of :class:`Observer`.
+    """Receives the contributions of each technique. The walk reports the contributions of camera
+    paths alone (s = 0 and 1) through the methods of :class:`Observer`.
 
     Attributes:
-        compares: Should the methods be given ``competing``? They take three words of each stored
-            vertex. (They are ``None`` otherwise.)
+        compares: Whether the methods receive ``competing``, which takes three words of each stored
+            vertex. (It is ``None`` otherwise.)
     """
 
     compares = False
@@ -72,12 +72,12 @@ class TechniqueObserver(Observer):
         if it goes on along the light path."""
 
     def searched(self, count: mi.UInt32) -> None:
-        """At a vertex of the camera path in each lane, so many vertices were looked at."""
+        """At a vertex of the camera path in each lane, ``count`` vertices were looked at."""
 
     def weighed(self, by_kind: mi.Vector2f) -> None:
         """A technique of camera paths alone has been weighed; its contribution is reported next
-        (``emission``, ``connection``). ``by_kind`` is that of :class:`CompetingDensities`."""
+        (``emission``, ``connection``). See :class:`CompetingDensities` for ``by_kind``."""
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
-        light paths included; ``whole`` those of all techniques."""
+        light paths included; ``whole`` holds the samples of all techniques."""

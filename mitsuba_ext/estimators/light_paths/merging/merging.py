@@ -28,28 +28,29 @@ from ..partial_sums import PartialSums
 from ..scattering import geometric_cosine, reverse_density
 from .vertex_grid import VertexGrid
 
-#: Vertices merge on surfaces that face about the same way: the least cosine between their normals;
-#: and within a flat cylinder: its half height in units of its radius. Light would otherwise leak
-#: around corners and through thin walls.
+#: Vertices merge if their surfaces face about the same way, and within a flat cylinder. Light would
+#: otherwise leak around corners and through thin walls. These are the least cosine between the
+#: normals, and half the height of the cylinder in units of its radius.
 _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
 
-#: So many vertices are found before they are evaluated. Lanes of a kernel search for different
-#: times, and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain
-#: nothing.)
+#: The number of vertices that are found before they are evaluated. Lanes of a kernel take different
+#: times to search, and all of them wait for the last one. (With 1, pool takes 1.2 times as long;
+#: 8 gain nothing.)
 BATCH = 4
 
-#: Light paths that measure how dense vertices are, and how often the radius of that is doubled at
-#: most.
+#: The number of light paths that measure how dense vertices are, and how often at most the radius
+#: of this measurement is doubled.
 PILOT_PATHS, DOUBLINGS = 1 << 16, 8
 
-#: The number of vertices that a disk is to hold. For MIS weights, so many vertices are one sample:
-#: they share a camera path, and other techniques often vary less than their densities tell. (With
-#: weights that count each vertex, the variance is 1.1 to 1.2 times as large in glass_lamp, pool and
-#: caustic; with fewer than a tenth of them, it stays about the same.)
+#: The number of photons that a disk should hold. MIS weights count this number of photons as one
+#: sample: they share a camera path, and other techniques often vary less than their densities
+#: suggest. (With weights that count each photon, the variance is 1.1 to 1.2 times as large in
+#: glass_lamp, pool and caustic; if they count fewer than a tenth of the photons, it stays about the
+#: same.)
 PHOTONS_PER_DISK = 8.0
 
-#: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
-#: of a pixel, in footprints of pixels.
+#: The least number of vertices that the measuring light paths must leave: with fewer, nothing is
+#: merged. And the largest radius of the first sample of a pixel, in footprints of pixels.
 FEW, WIDEST = 64, 8.0
 
 #: The largest radius of the first sample, in units of the diagonal of the scene: pixels of very
@@ -58,16 +59,16 @@ LARGEST = 0.04
 
 
 def widest_radius(scene: mi.Scene, footprint: float) -> float:
-    """The largest radius of the first sample of a pixel that is ``footprint`` wide (0: of a
+    """The largest radius of the first sample of a pixel that is ``footprint`` wide (0 for a
     radiance meter)."""
     largest = LARGEST * scene_diagonal(scene)
     return min(WIDEST * footprint, largest) if footprint > 0 else largest
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> float:
-    """The width of a pixel where the camera sees the scene: the median over the film; 0 if all rays
-    of a pixel are the same (a radiance meter). If rays through a grid of places on the film hit
-    nothing, a thousandth of the diagonal of the scene."""
+    """The width of a pixel where the camera sees the scene: the median over a grid of places on the
+    film. It is 0 if all rays of a pixel are the same (a radiance meter), and a thousandth of the
+    diagonal of the scene if no ray hits anything."""
     count = 64
     lane = dr.arange(mi.UInt32, count * count)
     position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
@@ -85,8 +86,8 @@ def median_footprint(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> f
 def _distances_in_pixels(
     scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, position: mi.Point2f
 ) -> np.ndarray:
-    """The distances between what two rays of a pixel hit, one through each of the places
-    ``position``; both use different random numbers."""
+    """The distances between the points that two rays of a pixel hit, for the pixel at each place
+    ``position``. The two rays use different random numbers."""
     size = mi.Vector2f(sensor.film().crop_size())
     numbers = mi.load_dict({"type": "independent"})
     numbers.seed(0, dr.width(position))
@@ -124,7 +125,7 @@ def suitable_radius(
     Parameters:
         light_walk: Traces the light paths.
         footprint: The width of a pixel where the camera sees the scene.
-        only_caustic: Are vertices merged only where light arrives from a delta lobe?
+        only_caustic: Whether vertices are merged only where light arrives from a delta lobe.
     """
     vertices = pilot_vertices(scene, sensor, light_walk)
     if vertices is None:
@@ -143,7 +144,7 @@ def pilot_vertices(
     rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, 0), PILOT_PATHS)
-    # Times and wavelengths are those of rays of the sensor
+    # Times and wavelengths are distributed as in the sensor's rays
     numbers = sampler.next_2d()
     rays, _ = sensor.sample_ray_differential(
         sensor.shutter_open() + numbers.x * sensor.shutter_open_time(), numbers.y,
@@ -165,11 +166,11 @@ def disk_radius(
     least: float,
 ) -> float | None:
     """The radius in which a disk around a vertex holds ``count`` vertices, on average over the
-    vertices. ``None`` if there are too few of them to tell.
+    vertices. ``None`` if there are too few vertices to measure it.
 
     Parameters:
         kept: See :class:`VertexGrid`.
-        least: The radius, at least, of the disks that are looked at.
+        least: The smallest radius of the disks in which vertices are counted.
     """
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
@@ -185,25 +186,25 @@ def disk_radius(
 
 
 def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
-    """The stack with ``value`` on top (first). The last element is dropped."""
+    """The stack with ``value`` on top, which is the first element. The last element is dropped."""
     return [dr.select(active, new, old) for new, old in zip([value, *stack[:-1]], stack)]
 
 
 class MergedSubpaths(Subpaths):
-    """Adds to each vertex of a camera path what light paths bring to the vertices near it.
+    """Adds, at each vertex of a camera path, the light that light paths bring to nearby vertices.
 
     Parameters:
         vertices: The vertices of the light paths, at least one.
         grid: Finds them.
-        sums: Computes the MIS weights; ``None`` if merging is the only technique that finds what it
+        sums: Computes the MIS weights; ``None`` if no other technique finds the light that merging
             finds.
         heroes: Joins the wavelengths of two paths.
         max_depth: Longest path in segments.
         paths: Number of light paths that a vertex can be merged with.
-        shares_rays: Are vertices merged only with those of paths of the same time and wavelengths?
-            ``grid`` then has these groups.
+        shares_rays: Whether vertices are merged only if their paths have the same time and
+            wavelengths. ``grid`` then has these groups.
         others: Other techniques at the same vertices; ``None`` if there are none.
-        observer: Is told what merging adds.
+        observer: Receives what merging adds.
     """
 
     def __init__(
@@ -259,7 +260,7 @@ class MergedSubpaths(Subpaths):
         return total, shadow_count
 
     def _is_merged(self, vertex: Vertex) -> mi.Bool:
-        """Where is light gathered?"""
+        """Whether light is gathered at ``vertex``."""
         return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:

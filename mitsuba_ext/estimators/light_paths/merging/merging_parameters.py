@@ -57,8 +57,8 @@ class MergingParameters:
         alone: bool = False,
     ) -> MergingRadius | None:
         """The radius for a render, before which others have made ``before`` samples per pixel;
-        ``None`` if there are no caustics to merge. ``alone``: is merging the only technique? The
-        other parameters are those of :func:`suitable_radius`."""
+        ``None`` if there are no caustics to merge. ``alone`` tells whether merging is the only
+        technique. See :func:`suitable_radius` for the other parameters."""
         if only_caustic and not _may_have_caustics(scene):
             return None
         footprint = median_footprint(scene, sensor, light_walk.query)
@@ -81,8 +81,8 @@ class MergingParameters:
     def ball_of(
         self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, before: int, given: float
     ) -> MergingRadius:
-        """As :meth:`radius_of`, for balls in participating media; ``given`` is their radius, 0 for
-        one that suits the scene."""
+        """Like :meth:`radius_of`, for balls in participating media; ``given`` is their radius, 0
+        for one that suits the scene."""
         footprint = median_footprint(scene, sensor, light_walk.query)
         width, height = film_extent(sensor.film())
         radius = given or suitable_ball(scene, sensor, light_walk, footprint, width * height)
@@ -93,7 +93,7 @@ class MergingParameters:
 
 
 def _may_have_caustics(scene: mi.Scene) -> bool:
-    """May a BSDF in ``scene`` have delta lobes? Those of instances and moving shapes are not known.
-    """
+    """Whether a BSDF in ``scene`` may have delta lobes. The BSDFs of instances and moving shapes
+    are not known, so they may."""
     bsdfs = [shape.bsdf() for shape in scene.shapes()]
     return any(b is None or int(b.flags()) & int(mi.BSDFFlags.Delta) for b in bsdfs)

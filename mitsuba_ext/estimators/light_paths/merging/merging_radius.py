@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 @dataclass
 class MergingRadius:
-    """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk, or a ball, holds about as many vertices whatever that
-    is. In short passes, such a disk would be wide, and its bias would outweigh the noise of all
-    passes together; ``widest`` limits the radius by the number of samples so far, in however many
-    passes.
+    """The radius of merging. It shrinks from pass to pass, so that bias vanishes. It also depends
+    on the number of light paths of a pass: a disk, or a ball, holds about the same number of
+    vertices in passes of any size. In short passes, such a disk would be wide, and its bias would
+    outweigh the noise of all passes together; ``widest`` limits the radius by the number of samples
+    so far, whatever the number of passes.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
     Transactions on Graphics 30(3), 2011: the area of the disk of pass i is proportional to
@@ -28,8 +28,8 @@ class MergingRadius:
             make their common error larger, and the disks of passes of any size have the same area
             after the same number of samples.
         before: Light paths per pixel of passes that other renders have made before.
-        widest: The largest radius after one light path per pixel; it shrinks with their number as
-            that of passes of one.
+        widest: The largest radius after one light path per pixel. It shrinks with the number of
+            light paths per pixel, as the radius does in passes of one light path per pixel.
         dimensions: 2 for disks, 3 for balls.
     """
 
@@ -43,8 +43,8 @@ class MergingRadius:
     _passes: int = 0
 
     def of_coarse_film(self, pixel_width: float) -> MergingRadius:
-        """That of a render of a film with fewer pixels, each as wide as ``pixel_width`` of them:
-        its disks are wider, and hold as many vertices."""
+        """The radius for a render with fewer pixels, each as wide as ``pixel_width`` pixels of the
+        film: its disks are wider, and hold the same number of vertices."""
         return replace(
             self,
             first=self.first * pixel_width ** (2 / self.dimensions),
@@ -54,16 +54,16 @@ class MergingRadius:
         )
 
     def next(self, paths: int, groups: int = 1) -> float:
-        """The radius of the next pass, of so many light paths; or of so many groups, of so many
-        light paths each, whose vertices are not merged with those of other groups."""
+        """The radius of the next pass, which has ``groups`` groups of ``paths`` light paths each.
+        Vertices of different groups are not merged."""
         per_pixel = paths / self.pixels
         number = self._passes + 1 + self.before / per_pixel
         self._passes += groups
         return self._radius(per_pixel, number)
 
     def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
-        """So many samples of a pixel, of the ``spp`` of a pass, find the same vertex, where any of
-        them does: their errors are the same. The mean over the first ``passes``.
+        """Of the ``spp`` samples that a pixel has in a pass: how many find the same vertex, where
+        any sample does, and thus have the same error. The mean over the first ``passes``.
 
         Parameters:
             light_paths: Number of light paths for each camera path.
@@ -75,7 +75,7 @@ class MergingRadius:
         return total / passes
 
     def _radius(self, per_pixel: float, number: float) -> float:
-        """That of the pass of this number, with so many light paths per pixel."""
+        """The radius of pass ``number``, with ``per_pixel`` light paths per pixel."""
         by_samples = (number * per_pixel) ** (self.decay - 1)
         shrinks = by_samples if self.footprint == 0 else number ** (self.decay - 1) / per_pixel
         power = 1 / self.dimensions

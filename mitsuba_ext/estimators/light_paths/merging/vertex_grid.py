@@ -21,8 +21,8 @@ class VertexGrid:
     """The vertices, sorted by the cell of a regular grid that they lie in. Cells are numbered by a
     hash, so that memory does not depend on the size of the scene.
 
-    The order of the vertices in a cell depends on threads: what is summed over them does so by
-    rounding.
+    The order of the vertices in a cell depends on threads; sums over them therefore differ from run
+    to run by rounding.
 
     Parameters:
         vertices: The vertices, at least one.

@@ -15,7 +15,7 @@ BEFORE, GATHERS, GATHERS_ON, ENDED = range(4)
 
 
 def is_diffuse(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Are photons stored on surfaces of this BSDF?"""
+    """Whether photons are stored on surfaces with this BSDF."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
 
 

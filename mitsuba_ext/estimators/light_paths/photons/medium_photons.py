@@ -64,12 +64,12 @@ class PassesThrough(Distances):
 
 
 class MergedInMedia(MergedSubpaths):
-    """Adds to camera paths what light paths bring to their surroundings in participating media.
+    """Adds to camera paths the light that light paths bring near them in participating media.
 
     Parameters:
         vertices, grid, heroes, max_depth, paths, shares_rays: See :class:`MergedSubpaths`.
         others: The light at surfaces.
-        has_grids: May there be media that are not homogeneous?
+        has_grids: Whether there may be media that are not homogeneous.
         observer: See :class:`MergedSubpaths`.
     """
 

@@ -27,7 +27,7 @@ _CONCENTRATION, _SHARE = 20.0, 0.5
 class PhotonDirections(Scattering):
     """Mixes BSDF samples with directions of photons, at the first diffuse vertex of a camera path.
 
-    Only indirect photons count that are not of a caustic: for other light, there is no gather.
+    Only indirect photons that belong to no caustic count: there is no gather for other light.
 
     Parameters:
         maps: The photons.
@@ -75,7 +75,7 @@ class PhotonDirections(Scattering):
         return value, dr.select(guides, _mixed(pdf, photons), pdf)
 
     def _guides(self, vertex: Vertex) -> mi.Bool:
-        """Where does a final gather begin?"""
+        """Whether a final gather begins at the vertex."""
         return vertex.si.is_valid() & (vertex.path.history == BEFORE) & is_diffuse(vertex.bsdf)
 
     @dr.syntax

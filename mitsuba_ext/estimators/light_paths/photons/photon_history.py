@@ -1,4 +1,4 @@
-"""What photons and virtual lights remember of their way."""
+"""What photons and virtual lights remember about their paths."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _StoredPhoton(StoredHistory):
 
 
 class PhotonProgram(LightProgram):
-    """Tells the photons of caustics."""
+    """Marks the photons of caustics."""
 
     stored = _StoredPhoton(word_count=1)
 
@@ -60,7 +60,7 @@ class _StoredRegion(StoredHistory):
 
 
 class RegionProgram(LightProgram):
-    """Tells the region in which each vertex lies.
+    """Stores the region in which each vertex lies.
 
     Parameters:
         selection: Divides surfaces into regions.
@@ -80,7 +80,7 @@ class RegionProgram(LightProgram):
 
 @dataclass
 class HiddenLight:
-    """What a photon remembers of its light.
+    """What a photon remembers about its light.
 
     Attributes:
         connectable: 0 if the photon left the light by way of a mirror or clear glass, so that no
@@ -108,7 +108,7 @@ class _StoredHiddenLight(StoredHistory):
 
 
 class HiddenLightProgram(LightProgram):
-    """Tells the photons of hidden lights, in scenes with media."""
+    """Marks the photons of hidden lights, in scenes with media."""
 
     stored = _StoredHiddenLight(word_count=2)
 

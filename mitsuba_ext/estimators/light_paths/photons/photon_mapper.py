@@ -29,13 +29,13 @@ from ..merging.merging_radius import MergingRadius
 from ..merging.vertex_grid import VertexGrid
 from .medium_photons import MergedInMedia, PassesThrough
 
-#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
-#: stored at a time.
+#: The largest number of bytes that a pass may store; and the approximate number of bytes that a
+#: path takes besides the vertices that are stored at a time.
 _PASS_BYTES, _PATH_BYTES = 1 << 29, 512
 
 
 def most_lanes(light_paths: float) -> int:
-    """The most camera paths in a pass, with so many light paths for each."""
+    """The largest number of camera paths in a pass, with ``light_paths`` light paths for each."""
     layout = Layout(len(mi.Spectrum()), StoredHistory(), True)
     bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
     return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
@@ -67,11 +67,11 @@ class PhotonMapper:
     Parameters:
         walk: Traces the camera paths; it makes no connections.
         light_walk: Traces the light paths.
-        radius: Within what radius vertices on surfaces are merged.
-        ball: Within what radius vertices in media are merged; ``None`` without media.
+        radius: The radius within which vertices on surfaces are merged.
+        ball: The radius within which vertices in media are merged; ``None`` without media.
         light_paths: Number of light paths for each camera path; 1 in spectral variants and with
             moving shapes.
-        observer: Is told of the passes, and of the vertices that are looked at.
+        observer: Receives the passes, and the vertices that are looked at.
     """
 
     walk: Walk
@@ -83,11 +83,11 @@ class PhotonMapper:
 
     @property
     def most_lanes(self) -> int:
-        """The most camera paths in a pass."""
+        """The largest number of camera paths in a pass."""
         return most_lanes(self.light_paths)
 
     def of_coarse_film(self, pixel_width: float) -> PhotonMapper:
-        """That of a film with fewer pixels, each as wide as ``pixel_width`` of them."""
+        """The mapper for a film with fewer pixels, each as wide as ``pixel_width`` of them."""
         return replace(
             self,
             radius=self.radius.of_coarse_film(pixel_width),
@@ -122,7 +122,7 @@ class PhotonMapper:
 
     def _merged(self, scene: mi.Scene, vertices: VertexCache, count: int) -> MergedSubpaths:
         """Adds the light of photons, from ``count`` light paths, to camera paths."""
-        # Of paths of different times or wavelengths, those of one sample of each pixel merge
+        # If times or wavelengths differ, only the paths of sample k of each pixel merge
         groups = mi.is_spectral or bool(movers(scene))
         group = vertices.group if groups else None
         paths = min(count, self.radius.pixels) if groups else count

@@ -1,10 +1,10 @@
-"""Photon maps, and what a camera path asks of them.
+"""Photon maps, and how a camera path uses them.
 
 A camera path has three parts. Up to its first *diffuse* vertex (one whose BSDF has a diffuse lobe),
 it is a path of Mitsuba's ``path``, with all weights. What light reaches that vertex from mirrors,
 glass and glossy surfaces is estimated from the caustics map. All other indirect light is found by
-one more segment (final gather), which ends at the next diffuse vertex: the global map tells how
-much light leaves it. Each path from a light to the camera belongs to exactly one of these.
+one more segment (final gather), which ends at the next diffuse vertex: the global map gives the
+light that leaves it. Each path from a light to the camera belongs to exactly one of these parts.
 
 Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH course,
 2004, section 10.5.
@@ -38,9 +38,9 @@ Kept = Callable[[mi.UInt32, mi.Bool], mi.Bool]
 
 @dataclass
 class PhotonMap:
-    """Photons, in grids of increasing radius. An estimate takes the first one that holds enough
-    photons around its place: so that it needs no list of the nearest ones, and adapts to how dense
-    they are.
+    """Photons, in grids of increasing radius. An estimate takes the first grid that holds enough
+    photons around its place. It thus needs no list of the nearest photons, and adapts to their
+    density.
 
     Attributes:
         grids: The grids.
@@ -58,7 +58,7 @@ class PhotonMaps:
     Attributes:
         vertices: The photons: vertices of light paths on diffuse surfaces; ``None`` if there are
             none.
-        caustics: The map of those that have met nothing but surfaces that are not diffuse.
+        caustics: The map of the photons that have met only surfaces that are not diffuse.
         gathered: The global map. With a final gather, all photons; without, the indirect ones that
             are not in ``caustics``.
     """
@@ -87,7 +87,7 @@ class PhotonMaps:
             final_gather: See :class:`PhotonSubpaths`.
             radii: Radii of the maps of caustics and of all light; 0 for those that suit the
                 photons.
-            lookup_size: Number of photons that an estimate is to use.
+            lookup_size: Number of photons that an estimate should use.
             least: See :func:`disk_radius`; 0 for one that suits the scene.
         """
         rounds: list[LightVertices] = []
@@ -138,7 +138,7 @@ class PhotonMaps:
 
 
 def photon_walk(light_walk: LightWalk) -> LightWalk:
-    """The walk, made to store photons: on diffuse surfaces, with what tells caustics."""
+    """The walk, changed to store photons on diffuse surfaces; their history marks caustics."""
     light_walk.program = PhotonProgram()
     light_walk.stored_lobes = mi.BSDFFlags.Diffuse
     return light_walk
@@ -169,8 +169,8 @@ class PhotonSubpaths(Subpaths):
 
     Parameters:
         caustics, gathered: Estimate radiance from the two maps; ``None`` for an empty one.
-        final_gather: Is the global map looked up at the end of the last segment? If not, it is
-            looked up at the first diffuse vertex.
+        final_gather: Whether the global map is looked up at the end of the last segment. If not, it
+            is looked up at the first diffuse vertex.
     """
 
     def __init__(

@@ -1,1 +1,2 @@
-"""Which vertices of light paths a vertex is connected to, by learned visibility of regions."""
+"""Chooses the light path vertices to which a vertex is connected, by learned visibility of
+regions."""

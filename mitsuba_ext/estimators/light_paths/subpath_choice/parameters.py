@@ -25,7 +25,7 @@ _PATHS = 1 << 15
 
 
 class LearnedSubpaths(Technique):
-    """Chooses light vertices by how much those of their region contributed in the pilots."""
+    """Chooses light vertices by how much the vertices in their region contributed in the pilots."""
 
     name = "visibility"
     slots, words = ("subpath_selection",), {"visibility": {}}

@@ -19,8 +19,8 @@ from ....util.stored_arrays import StoredArrays
 from .pair_records import PairRecords
 from .region_table import RegionTable
 
-#: Share of the choices by the number of vertices alone: each vertex is chosen at least a tenth as
-#: often as by a uniform choice.
+#: Share of the choices that depend on the number of vertices alone: each vertex is chosen at least
+#: a tenth as often as by a uniform choice.
 _DEFENSIVE = 0.1
 
 #: The weight, in connections, of the estimate for a pair of larger regions, as a prior.

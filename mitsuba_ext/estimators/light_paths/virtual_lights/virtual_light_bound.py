@@ -1,4 +1,4 @@
-"""How the light of virtual point lights is bounded, and how a camera path makes up for it.
+"""How the light of virtual point lights is bounded, and how a camera path compensates for it.
 
 The kernel of a connection to a virtual light has a weak singularity: it grows with 1 / distance².
 A connection therefore counts at most as if its kernel were the bound b. The rest is found where the
@@ -32,22 +32,22 @@ from ..both_ends import from_both_ends
 
 
 def is_connected(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Has the BSDF a part that is not a delta distribution? Virtual lights lie on such surfaces,
-    and camera paths are connected to them from such surfaces."""
+    """Whether the BSDF has a part that is not a delta distribution. Virtual lights lie on such
+    surfaces, and camera paths are connected to them from such surfaces."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 
 @dataclass
 class Link:
-    """What a camera path remembers of virtual lights.
+    """What a camera path remembers about virtual lights.
 
     Attributes:
         share: The product of the weights of all earlier segments.
         kernel: The part of the last segment's kernel that does not depend on how the path goes on;
             infinite if no virtual light could have found the segment.
         plain: The same for the geometry term alone.
-        connects: Was the last vertex connected to virtual lights, and left in a direction in which
-            these could have been?
+        connects: Whether the last vertex was connected to virtual lights, and the path left it in a
+            direction in which they can lie.
         region: The region in which the last vertex lies; ``None`` if virtual lights are not chosen
             by regions.
     """
@@ -64,8 +64,8 @@ class Bound:
 
     Parameters:
         bound: The largest kernel, in 1 / length².
-        compensates: Does the camera path make up for all of what is cut off? If not, only for what
-            is cut off because surfaces are glossy.
+        compensates: Whether the camera path makes up for all light that the bound cuts off. If not,
+            it makes up only for what is cut off because surfaces are glossy.
 
     Attributes:
         largest (mi.Float): The largest kernel.
@@ -144,7 +144,7 @@ class CompensatingPaths(EndingProgram):
         )  # fmt: skip
 
     def emission(self, weights, scene, si, ds, path, pdf):
-        # Light from a lamp to the last vertex is no virtual light's
+        # Light that reaches the last vertex directly from a lamp belongs to no virtual light
         return super().emission(weights, scene, si, ds, path, pdf) * path.history.share
 
     def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf):

@@ -1,4 +1,4 @@
-"""Choosing virtual lights without looking at the vertex that they are to light."""
+"""Choosing virtual lights without looking at the vertex that they illuminate."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class VirtualLightChoice(Protocol):
     """Chooses a virtual light for each vertex of a camera path.
 
     Attributes:
-        is_stratified: Are the first numbers of several connections to be evenly spread?
+        is_stratified: Whether the first numbers of several connections should be evenly spread.
     """
 
     is_stratified: bool
@@ -86,9 +86,9 @@ class PowerChoice(UniformChoice):
 
 
 class LearnedChoice:
-    """Chooses a region by what pilots found its light to contribute to the region of the camera
-    path's vertex, occlusion included, and by the brightness of the virtual lights that are there;
-    then one of these by flux. The sets of a pass are one.
+    """Chooses a region by the contribution of its light to the region of the camera path's vertex,
+    as pilots have measured it with occlusion, and by the brightness of the virtual lights in it;
+    then chooses one of these lights by flux. All sets of a pass are used as one.
 
     Parameters:
         lights: The virtual lights.
@@ -162,7 +162,7 @@ def _evaluated(
     to_camera = mi.SurfaceInteraction3f(si)
     to_camera.wi = along_normal
     value, _pdf = eval_bsdf(si.bsdf(), mi.BSDFContext(), to_camera, si.wi, active)
-    # Glossy surfaces scatter little along the normal: none is to be left out
+    # Glossy surfaces scatter little along the normal, but none should be left out
     albedo = dr.clip(dr.pi * dr.max(value) / cosine, 0.05, 1)
     brightness = dr.sum(dr.abs(vertex.β))
     exists = active & dr.isfinite(brightness) & dr.isfinite(albedo)
@@ -179,9 +179,9 @@ def _slots(flux: np.ndarray, number: np.ndarray, room: int) -> tuple[np.ndarray,
     have room for more, so that passes share a recording.
 
     Parameters:
-        flux: Of each virtual light, group by group.
-        number: Of virtual lights, in each group.
-        room: For so many virtual lights.
+        flux: The flux of each virtual light, group by group.
+        number: The number of virtual lights in each group.
+        room: The number of virtual lights for which the table has room.
     """
     count = np.empty(len(flux), np.uint32)
     begin = np.cumsum(number) - number

@@ -30,8 +30,8 @@ class VirtualLightConnections(Subpaths):
         query: Intersects rays with the scene.
         connections: Number of connections of a vertex.
         max_depth: Longest path in segments.
-        observer: Is told of connections to virtual lights that are chosen by regions.
-        parts: Is told the light of virtual lights; ``None`` if nobody asks.
+        observer: Receives the connections to virtual lights that are chosen by regions.
+        parts: Receives the light of virtual lights; ``None`` if it is not needed.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class VirtualLightConnections(Subpaths):
         chosen = self._choice.choose(numbers, vertex, active)
         active = chosen.active
         other = self._vertices.at(chosen.index, active)
-        # Segments of the path: those of both subpaths, and one that connects them
+        # Segments of the path: the segments of both subpaths, and one that connects them
         active &= vertex.depth + other.depth + 2 <= self._max_depth
         si, far = vertex.si, other.si
         d = far.p - si.p

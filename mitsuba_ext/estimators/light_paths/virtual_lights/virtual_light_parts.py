@@ -89,7 +89,7 @@ class PictureOfLights:
     def values(
         self, scene: mi.Scene, lights: VirtualLights | None, walk: Walk, numbers, rays: CameraRays
     ) -> mi.Spectrum:
-        """What each camera sample adds to the mean of its pixel."""
+        """The value that each camera sample adds to the mean of its pixel."""
         total = dr.zeros(mi.Spectrum, dr.width(rays.ray))
         if self._sensor is None or lights is None:
             return total
@@ -108,7 +108,7 @@ class PictureOfLights:
         place = mi.Point2u(splats.position - self._offset)
         pixel = place.y * self._width + place.x
         begin, end = (_lane_of(rays.pixel, pixel + after) for after in (0, 1))
-        # The mean over the samples of the pixel is that of their number of splats
+        # The film divides the sum by the number of the pixel's samples; this factor cancels that
         value = splats.value * mi.Float(end - begin)
         dr.scatter_add(total, value, begin, splats.active & (end > begin))
 

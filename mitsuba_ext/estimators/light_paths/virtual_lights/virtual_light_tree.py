@@ -3,8 +3,8 @@
 Each set has a complete binary tree over its virtual lights, sorted along a space-filling curve. A
 choice goes down from the root, and takes a child with a probability proportional to an estimate of
 what its virtual lights contribute: their flux, times a geometry term between the vertex and the
-bounding sphere of the child, at most the bound. The estimate is not 0 where there is flux, so that
-a wrong one makes noise, but no bias.
+bounding sphere of the child, at most the bound. The estimate is not 0 where there is flux, so a
+wrong estimate causes noise, but no bias.
 
 Source: B. Walter et al., *Lightcuts: A Scalable Approach to Illumination*, ACM Transactions on
 Graphics 24(3), 2005 (the tree, and the bounds of cosines and distances); A. Conty Estevez,
@@ -25,7 +25,7 @@ from .virtual_light_choice import emitted_flux
 from .virtual_lights import VirtualLights
 
 #: Added to estimated cosines, so that none is 0: BSDFs may transmit light, and shading normals may
-#: differ from those of surfaces.
+#: differ from geometric normals.
 _LEAST_COSINE = 0.05
 
 #: Numbers of a node: centre and radius of the sphere, mean normal, flux.
@@ -51,7 +51,7 @@ class ClusteredChoice:
         nodes, leaf = _trees(lights)
         self._levels = leaf.shape[1].bit_length() - 1
         self._nodes, self._leaf = from_numpy(mi.Float, nodes), from_numpy(mi.UInt32, leaf)
-        # Halves of the way down take a random number each, since one has 24 bits only
+        # Each half of the way down takes its own random number, because one has only 24 bits
         self._half, self._depth = (
             dr.opaque(mi.UInt32, n) for n in ((self._levels + 1) // 2, self._levels)
         )
@@ -99,13 +99,13 @@ class ClusteredChoice:
         )
         d = mi.Vector3f(w[0], w[1], w[2]) - p
         radius, flux, axis = w[3], w[7], mi.Vector3f(w[4], w[5], w[6])
-        # No node is estimated to be nearer than its size
+        # The estimated distance of a node is at least its radius
         squared = dr.maximum(dr.squared_norm(d), dr.square(radius))
         inverse = dr.rsqrt(dr.maximum(squared, 1e-30))
         received = dr.dot(n, d)
         received = dr.select(transmits, dr.abs(received), received)
         received = dr.clip((received + radius) * inverse, 0, 1)
-        # A mean normal of length 1 is that of all; one of length 0 tells nothing
+        # A mean normal of length 1 is the normal of all lights; one of length 0 says nothing
         emitted = -dr.dot(axis, d) * inverse + (1 - dr.norm(axis)) * 0.5 + radius * inverse
         emitted = dr.clip(emitted, 0, 1)
         G = (received + _LEAST_COSINE) * (emitted + _LEAST_COSINE) * dr.square(inverse)

@@ -25,9 +25,9 @@ class Sets:
 
     Attributes:
         pixels: Number of pixels of the film.
-        width: Of these, in a row.
+        width: Number of pixels in a row.
         paths: Number of light paths of a set.
-        interleaving: The sets of a sample form a pattern of so many pixels, in both directions.
+        interleaving: Width and height, in pixels, of the pattern that the sets of a sample form.
     """
 
     pixels: int
@@ -36,7 +36,7 @@ class Sets:
     interleaving: int = 1
 
     def count(self, lanes: int) -> int:
-        """The number of sets of a pass of so many samples."""
+        """The number of sets of a pass with one sample in each of ``lanes``."""
         wanted = self._spp(lanes) * self.interleaving**2
         most = min(MOST_PATHS, lanes // _SAMPLES_PER_PATH) // self.paths
         return max(1, min(wanted, max(self.interleaving**2, most), MOST_PATHS // self.paths))
