@@ -10,8 +10,8 @@ density that is not finite as zero. Everything else is returned unchanged.
 
 A failed sample has a direction and a density nevertheless: where the microfacet of
 ``roughdielectric``, ``principled`` or ``principledthin`` sends light to the wrong side, ``bs.pdf``
-is the density of *successful* samples of that direction, which has another lobe. Only the weight
-tells. Whoever uses the direction without the weight needs :func:`sample_bsdf`.
+is the density of *successful* samples of that direction, which come from another lobe. Only the
+weight shows the failure. Code that uses the direction without the weight needs :func:`sample_bsdf`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""All that the kernels of a frozen function (``frozen.py``) depend on."""
+"""Everything that the kernels of a frozen function (``frozen.py``) depend on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 #: Values that are their own description.
 VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
-#: Sensors of Mitsuba 3.9.1 that hold arrays of which Dr.Jit is not told.
+#: Sensors of Mitsuba 3.9.1 that hold arrays which they do not report to Dr.Jit.
 SENSORS_WITH_HIDDEN_ARRAYS = frozenset({"ThinLensCamera", "OrthographicCamera"})
 
 
@@ -29,7 +29,7 @@ def address(thing: mi.Object) -> int:
 
 
 class CallDescription:
-    """Describes arguments by all that matters to kernels, except the contents of arrays.
+    """Describes arguments by everything that matters to kernels, except the contents of arrays.
 
     Parameters:
         scene: The scene that is rendered.

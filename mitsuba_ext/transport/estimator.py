@@ -64,8 +64,8 @@ class Sample:
 
     Attributes:
         L: Radiance estimate.
-        valid: Whether the path hit a surface that scattered it (or the visible environment). It is
-            alpha. ``L`` need not be zero elsewhere: a null surface may be lit.
+        valid: Whether the path hit a surface that scattered it (or the visible environment); this
+            becomes alpha. ``L`` need not be zero elsewhere: a null surface may be lit.
         scatter_count: Rays traced in directions that a BSDF chose.
         shadow_count: Shadow rays traced. Counts are arrays of any width, of which the sum matters.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray

@@ -90,8 +90,8 @@ def track(
         active: Whether the ray begins in a medium of varying density.
 
     Returns:
-        The distance of the first real collision, the throughput up to that (coefficient of
-        scattering included) or to the surface, and whether there is a collision.
+        The distance of the first real collision; the throughput up to the collision (scattering
+        coefficient included) or to the surface; and whether there is a collision.
     """
     ray = mi.Ray3f(ray)
     start, t, β = mi.Point3f(ray.o), mi.Float(t), mi.Spectrum(β)

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 #: A bit that Mitsuba does not use. In the flags of a BSDF, which wrapper BSDFs pass on, it means
-#: that the BSDF disperses light. In the ``type_mask`` of a ``BSDFContext``, of which Mitsuba reads
+#: that the BSDF disperses light. In the ``type_mask`` of a ``BSDFContext``, where Mitsuba reads
 #: only the bits of lobes, it means that the caller lets only the hero be refracted. A dispersive
 #: BSDF refuses to work for other callers.
 DISPERSES = 1 << 30
@@ -108,11 +108,11 @@ class Heroes:
         si: mi.SurfaceInteraction3f,
         bs: mi.BSDFSample3f,
     ) -> tuple[mi.Spectrum, mi.Float | float, Any]:
-        """The same for a BSDF sample.
+        """The weight of a BSDF sample.
 
         Returns:
             The weight by which the throughput is to be multiplied; the factor in it that makes up
-            for the lost wavelengths, which Russian roulette must divide out; and the new state.
+            for the lost wavelengths, by which Russian roulette must divide; and the new state.
         """
         if not self._is_needed:
             return bsdf_weight, 1.0, is_alone
@@ -141,7 +141,7 @@ class Heroes:
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
     ) -> mi.Spectrum:
-        """As :meth:`join`, for two paths that meet at one vertex."""
+        """Like :meth:`join`, for two paths that meet at one vertex."""
         if not self._is_needed:
             return bsdf_value
         return self._joined(bsdf_value, self._refracts(bsdf, si, wo), is_alone, other_is_alone)

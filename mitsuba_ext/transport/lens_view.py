@@ -28,7 +28,7 @@ class LensView:
     Parameters:
         scene: The scene.
         sensor: A ``thinlens``, or a ``perspective``, whose rays begin in the middle. It may move:
-            depths are those in the frame in which it rests.
+            depths are measured in the frame in which it rests.
         query: How rays intersect the scene.
     """
 

@@ -43,7 +43,7 @@ class LightTable(EmitterSampling):
     """Chooses a cell with the probabilities of the vertex's row, then a point on it.
 
     Parameters:
-        rows: Tells which row a vertex uses.
+        rows: Decides which row a vertex uses.
         cells: The cells to choose from.
         weights: For each row, a weight for each cell; shape [rows · cells], not negative. A row of
             zeros chooses uniformly.

@@ -115,13 +115,13 @@ def _arrays(numbers: Numbers) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# Not a dataclass: loops only read it, and it has not the width of their state
+# Not a dataclass: loops only read it, and it does not have the width of their state
 class NumberTable:
     """A vector of numbers for each lane.
 
     Parameters (and attributes):
-        values: In [0, 1): all first numbers, then all second ones, and so on.
-        lanes: How many lanes there are.
+        values: Numbers in [0, 1): all first numbers, then all second ones, and so on.
+        lanes: Number of lanes.
     """
 
     def __init__(self, values: mi.Float, lanes: int) -> None:
@@ -134,8 +134,8 @@ class StoredNumbers:
     """Numbers from a stored vector, for replay: lane i draws the numbers of lane i of the table.
 
     Attributes:
-        table: The numbers. After the last one, all are 0: a path that asks for more than is stored
-            is not the one that was stored.
+        table: The numbers. After the last one, all are 0: a path that draws more numbers than are
+            stored is not the stored path.
         lane: Which vector a lane draws from.
         index: How many numbers a lane has drawn.
     """

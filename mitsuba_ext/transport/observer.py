@@ -40,7 +40,7 @@ class Observer:
     ) -> None:
         """``path`` may have hit a light, in the direction ``ds`` from its last vertex, and gains
         ``value``, the MIS weight ``mis`` included. ``pdf`` is the density with which a connection
-        finds this direction; 0 where none can."""
+        finds this direction; 0 where no connection can."""
 
     def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
         """A path is about to connect ``vertex`` to lights."""

@@ -12,8 +12,8 @@ kinds of scenes have smaller offsets:
   follows the rounding errors of intersections. These are at most 5 units in the last place of the
   distance that a ray has flown, or of the largest coordinate of a triangle. Both are bounded by the
   size of the scene, cameras and lights included. (Measured with Embree, for meshes, spheres and
-  disks. Intersections with cylinders and curves are 10 to 100 times less exact, and those on a GPU
-  are not known: scenes that have these keep the other offsets.)
+  disks. Intersections with cylinders and curves are 10 to 100 times less exact, and the errors on a
+  GPU are not known: in both cases, scenes keep the other offsets.)
 
 Source: M. Pharr et al., *Physically Based Rendering*, 4th edition, 2023, section 6.8 (managing
 rounding error).
@@ -103,7 +103,7 @@ def ray_starts(scene: mi.Scene) -> RayStarts:
 
 def _size(scene: mi.Scene) -> float:
     """The largest coordinate of a scene, cameras and lights included: intersections are less exact
-    for rays that come from afar."""
+    for rays that come from far away."""
     box = scene_bounds(scene)
     for sensor in scene.sensors():
         box.expand(sensor.bbox())

@@ -9,11 +9,11 @@ from .bsdfs import eval_bsdf
 from .vertex import PathState, Vertex
 
 
-# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+# Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
 class Replay:
     """Propagates derivatives at each vertex of paths that are traced a second time, with the same
-    random numbers. The walk tells what the path gains at a vertex; what it gains later is the known
-    radiance of the path without what it has gathered so far. Densities, MIS weights and learned
+    random numbers. The walk reports what the path gains at a vertex; what it gains later is the
+    known radiance of the path minus what it has gathered so far. Densities, MIS weights and learned
     decisions are constants: the estimators are detached.
 
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation*, ACM Transactions on
@@ -51,8 +51,8 @@ class Replay:
     def connected(
         self, vertex: Vertex, ds: mi.DirectionSample3f, share: mi.Spectrum, visible: mi.Bool
     ) -> None:
-        """``vertex`` is connected to a light. ``share``: what the path gains is this, times
-        BSDF · radiance / density."""
+        """``vertex`` is connected to a light. The path gains ``share`` · BSDF · radiance /
+        density."""
         si = vertex.si
         with dr.resume_grad():
             radiance = self._scene.eval_emitter_direction(si, ds, visible)

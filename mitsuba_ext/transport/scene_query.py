@@ -1,4 +1,4 @@
-"""How rays intersect the scene: a decision of the walk, as Mitsuba's ``path`` takes it."""
+"""How rays intersect the scene: a decision of the walk. This one is the same as in ``path``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class SceneQuery:
     """How rays intersect the scene.
 
     Parameters (and attributes):
-        starts: Where rays start that leave a surface; by default, where Mitsuba's do.
+        starts: Where rays that leave a surface start; by default, the same as in Mitsuba.
     """
 
     def __init__(self, starts: RayStarts = RayStarts()) -> None:  # noqa: B008  (never modified)

@@ -1,4 +1,4 @@
-"""Paths weighted by how many of the optimized things they meet."""
+"""Paths weighted by the number of optimized BSDFs and lights that they meet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Sensitivity(PathProgram):
     as colours. The history is the number of optimized BSDFs before the vertex.
 
     Parameters:
-        optimized: What is optimized.
+        optimized: The BSDFs and lights that are optimized.
     """
 
     def __init__(self, optimized: Optimized) -> None:

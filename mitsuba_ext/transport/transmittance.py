@@ -22,9 +22,10 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """An unbiased estimate of the transmittance between a vertex and a point of a light. In
-    homogeneous media, it is computed, or estimated with a random distance; in others, by ratio
-    tracking (Novák et al., section 4.2). 0 where a surface that is not index-matched is in between.
+    """An unbiased estimate of the transmittance between a vertex and a point on a light. In
+    homogeneous media, it is computed, or estimated with a random distance; in others, it is
+    estimated by ratio tracking (Novák et al., section 4.2). It is 0 where a surface that is not
+    index-matched lies in between.
 
     Parameters:
         query: How rays intersect the scene.

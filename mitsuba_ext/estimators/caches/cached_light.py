@@ -1,12 +1,12 @@
 """Camera paths that end at cached irradiance.
 
 Up to the first vertex at which a *diffuse lobe* is sampled, a camera path is one of ``path``.
-There, the cache tells the irradiance of indirect light. One more segment finds direct light, as in
-``path``; whatever it hits, the path ends there. Where no record is valid, the path goes on as one
+There, the cache gives the irradiance of indirect light. One more segment finds direct light, as in
+``path``, and the path ends where it hits. Where no record is valid, the path goes on as one
 of ``path``.
 
 The lobe is the one that the BSDF says it has sampled. The other lobes go on as in ``path``: this is
-the balance heuristic between lobes, so that what the diffuse one is left with has no highlight.
+the balance heuristic between lobes, so the part of the diffuse lobe has no highlight.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ class CachedLight(CachedPaths):
 
 
 class FindsPlaces(CachedPaths):
-    """Stores where camera paths ask the cache, and which of these places no record covers. What is
-    seen by way of glossy lobes is left out: such places are many, and all over the scene.
+    """Stores the places where camera paths ask the cache, and which of these no record covers.
+    Places seen by way of glossy lobes are left out, because there are many, all over the scene.
 
     Parameters:
         grid: Finds records.

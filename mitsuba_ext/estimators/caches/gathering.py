@@ -28,7 +28,8 @@ class Gatherer:
         walk: Traces the paths. Its ``max_depth`` counts from the place.
         strata: The strata of the hemisphere.
         bounds: The smallest and the largest reach of a record, in widths of a pixel.
-        extrapolated: How far a record's gradient is used at least, likewise.
+        extrapolated: The least distance over which a record's gradient is used, in widths of a
+            pixel.
         share: See :func:`~.hemisphere.without_outliers`.
         seed: Seed of all random numbers.
     """
@@ -64,7 +65,7 @@ class Gatherer:
         return made_of(places, found, frames, self._bounds)
 
     def _traced(self, places: Places, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The radiance through each stratum, and how far away its origin is."""
+        """The radiance through each stratum, and the distance of the surface that it comes from."""
         M, N, count = self._strata.rings, self._strata.sectors, len(places)
         lanes = count * M * N
         sampler = mi.load_dict({"type": "independent"})

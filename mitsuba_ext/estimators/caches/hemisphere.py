@@ -51,7 +51,7 @@ class Irradiance:
         value: E: [record, channel].
         rotation: The change with the normal n' is (n × n') · ``rotation``: [record, channel, 3], in
             the frame of the place.
-        translation: The change with the place, likewise: the gradient.
+        translation: The change with the place, in the same frame: the gradient.
         distance: The harmonic mean of the distances of what is seen: [record].
         deviation: Standard error of the brightest channel, as if there were no strata: [record].
         slope_deviation: The same of the length of ``translation``.

@@ -98,8 +98,9 @@ class RecordGrid:
     def _weight(
         self, index: mi.UInt32, p: mi.Point3f, n: mi.Normal3f, level: mi.UInt32, active: mi.Bool
     ) -> mi.Float:
-        """The weight of a record: 1 − ε/a where ε < a, so that nothing jumps where a record ceases
-        to be valid. (Eq. 10.9 has 1/ε: the noise of each record then shows at its place.)"""
+        """The weight of a record: 1 − ε/a where ε < a, so that the result is continuous where a
+        record ceases to be valid. (Eq. 10.9 has 1/ε, which shows the noise of each record at its
+        place.)"""
         row = index * (2 + 2 * self._channels)
         first = dr.gather(mi.Vector4f, self._records, row, active)
         second = dr.gather(mi.Vector4f, self._records, row + 1, active)

@@ -145,7 +145,7 @@ class Records:
         return replace(self, reach=reach.astype(np.float32))
 
     def _is_wrong(self, index: np.ndarray, accuracy: float) -> np.ndarray:
-        """Which of its neighbours does a record predict wrongly, within its reach?"""
+        """The neighbours that a record predicts wrongly, within its reach."""
         way = self.p[index] - self.p[:, None]
         turn = np.cross(self.n[:, None], self.n[index])
         predicted = self.irradiance[:, None] + np.einsum("rcx,rkx->rkc", self.translation, way)

@@ -73,8 +73,8 @@ class DepthMaps:
         return dr.select(inverse_depth > 0, place, 0)
 
     def _film_position(self, p: mi.Point3f, numbers: mi.Point2f) -> mi.Point2f:
-        """Where on the film, in units of its size, a point is seen through a point of the
-        aperture."""
+        """The position on the film, in units of its size, at which a point is seen through a point
+        of the aperture."""
         it = dr.zeros(mi.Interaction3f, dr.width(p))
         it.p = p
         ds, _ = self._sensor.sample_direction(it, numbers)
@@ -105,7 +105,8 @@ class DepthMaps:
         return active & (dr.gather(mi.Float, self._maps, index, active) <= nearest)
 
     def _seen_from(self, place: mi.Point3f, numbers: mi.Point2f) -> mi.Point2f:
-        """Where on the film the point of a place is seen through a point of the aperture."""
+        """The position on the film at which the point of a place is seen through a point of the
+        aperture."""
         ray, _ = self._sensor.sample_ray(
             0, _MIDDLE, mi.Point2f(place.x, place.y), mi.Point2f(_MIDDLE)
         )

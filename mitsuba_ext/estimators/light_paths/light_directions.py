@@ -2,18 +2,19 @@
 
 A light path that arrives from ``a`` and leaves to ``b`` carries on with the value that a camera
 path, which arrives from ``b``, finds for light from ``a`` (``scattering.py``). Most BSDFs are
-reciprocal, so that the density of samples of a camera path that arrives from ``a`` suits that value
-as well. For the others it does not: it is small or zero where the value is not. A bump map turns
+reciprocal, so the density of samples of a camera path that arrives from ``a`` suits that value as
+well. It does not suit the other BSDFs: it is small or zero where the value is not. A bump map turns
 its frame towards the side from which a path arrives; from one path to the reverse one, the frame
-changes, and up to a fifth of the light goes where no sample does. There, a share of the directions
-is drawn from the cosine with the geometric normal, which is a factor of the value, on both sides of
-the surface (a mixture, or one-sample MIS with the balance heuristic: Veach, PhD thesis, section
-9.2.4). The weight of a sample is then at most about 2π / 0.2 times the value without its cosine,
-which is large at grazing angles: it reaches 1400 at a ``principledthin`` of roughness 0.3.
+changes, and up to a fifth of the light goes in directions that are never sampled. For these BSDFs,
+a share of the directions is drawn from the cosine with the geometric normal, which is a factor of
+the value, on both sides of the surface (a mixture, or one-sample MIS with the balance heuristic:
+Veach, PhD thesis, section 9.2.4). The weight of a sample is then at most about 2π / 0.2 times the
+value without its cosine, which is large at grazing angles: it reaches 1400 at a ``principledthin``
+of roughness 0.3.
 
-A mirror under a bump map leads light and camera paths the same way only if the frame is the same
-for both. A sample of such a mirror therefore has the weight with which a camera path passes it in
-the reverse direction: zero if the mirror leads that path elsewhere.
+A mirror under a bump map reflects light paths and camera paths the same way only if the frame is
+the same for both. A sample of such a mirror therefore has the weight with which a camera path
+passes it in the reverse direction. This weight is zero if the mirror reflects that path elsewhere.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ class LightSide:
         return cls(emission, target, correct)
 
     def next_event(self, chosen: EmitterSampling | None) -> EmitterSampling | None:
-        """How camera paths choose lights where there are light paths too; ``None`` for Mitsuba's
-        choice. ``chosen`` is what the scene asks for."""
+        """The decision by which camera paths choose lights in integrators with light paths;
+        ``None`` for Mitsuba's choice. ``chosen`` is the decision that the scene asks for."""
         return self.correct if chosen is None else FromBothEnds(chosen)
 
 

@@ -26,7 +26,7 @@ _INSIDE = ("int_ior", "cauchy", "sellmeier")
 
 
 class DispersiveInterface:
-    """A surface between a clear medium, which may be dispersive, and one outside, which is not.
+    """A surface between a clear medium, which may be dispersive, and an outer one, which is not.
 
     Parameters:
         plugin: The plugin's name, for errors.

@@ -1,4 +1,4 @@
-"""Output variables, as Mitsuba's ``aov`` has them, of scenes with shapes that it does not see."""
+"""The output variables of Mitsuba's ``aov``, for scenes with shapes that ``aov`` does not see."""
 
 from __future__ import annotations
 

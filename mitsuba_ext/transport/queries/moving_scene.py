@@ -26,7 +26,7 @@ class MovingSceneQuery(SceneQuery):
     Parameters:
         scene: The static scene.
         moving: The movers, as from :func:`movers`.
-        starts: Where rays start that leave a surface.
+        starts: Where rays that leave a surface start.
 
     Attributes:
         scenes (list[mi.Scene]): The shapes of each mover, at rest.

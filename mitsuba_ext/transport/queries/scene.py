@@ -1,4 +1,4 @@
-"""How the walk intersects rays with all that a scene holds."""
+"""How the walk intersects rays with everything in a scene."""
 
 from __future__ import annotations
 

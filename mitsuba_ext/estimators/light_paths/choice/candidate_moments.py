@@ -47,8 +47,8 @@ class CandidateMoments:
     ) -> None:
         self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
         self._block_of = block_of
-        # MIS weights count a handful of vertices as one sample of a camera path; but these samples
-        # share vertices
+        # MIS weights count ``PHOTONS_PER_DISK`` vertices as one sample of a camera path, but these
+        # samples share vertices
         shared = [samples_per_vertex.get(c.light_paths, 1.0) / PHOTONS_PER_DISK for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
         self._factors = from_numpy(mi.Float, [

@@ -140,7 +140,7 @@ class LightPathTrial(Trial):
             there are pilots of all pixels.
 
     Attributes:
-        samples: A pixel for each sample, of these only.
+        samples: The pixel of each sample of the trial.
         rival: What light paths had to beat.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.

@@ -26,8 +26,8 @@ class TechniqueObserver(Observer):
 
     def start(self, rays: CameraRays, available: Available) -> None:
         """A pass begins, with these camera rays, and with all techniques that are available. The
-        values reported for camera paths are radiance: the importance of the rays has yet to
-        multiply them. The values of splats include it."""
+        values reported for camera paths are radiance, not yet multiplied by the importance of the
+        rays. The values of splats include it."""
 
     def joined(
         self,

@@ -118,9 +118,9 @@ def suitable_radius(
     pixels: int,
     only_caustic: bool,
 ) -> float | None:
-    """The radius in which a disk holds a handful of the vertices of one light path per pixel, where
-    there are vertices on surfaces: measured by a few light paths. ``None`` if these leave too few
-    vertices.
+    """The radius in which a disk holds ``PHOTONS_PER_DISK`` vertices, with one light path per
+    pixel, on average over the vertices on surfaces. A few light paths measure it. ``None`` if they
+    leave too few vertices.
 
     Parameters:
         light_walk: Traces the light paths.

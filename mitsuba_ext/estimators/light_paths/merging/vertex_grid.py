@@ -11,9 +11,9 @@ import numpy as np
 
 from ..light_vertices import VertexCache
 
-#: Cells are two radii wide in y and z, so that a ball overlaps four rows of cells along x. In x,
-#: this number of cells is two radii wide. Cells of a row have buckets next to each other: one range
-#: of vertices holds all of them that a ball overlaps.
+#: Cells are two radii wide in y and z, so a ball overlaps four rows of cells along x. In x, this
+#: number of cells is two radii wide. The cells of a row have adjacent buckets, so the vertices of
+#: all cells of a row that a ball overlaps are one range.
 _PER_DIAMETER, _ROWS = 2, 4
 
 
@@ -29,9 +29,9 @@ class VertexGrid:
         radius: Radius of the balls in which vertices are looked for.
         kept: Tells which vertices, given by their indices and a mask, are in the grid; all of them
             if it is ``None``.
-        group: Gives the number of a vertex's group, as ``kept``: vertices are looked for in one
-            group at a time. (Different groups may have the same number: callers check.) ``None`` if
-            there is only one.
+        group: Returns the number of a vertex's group; its arguments are the same as for ``kept``.
+            Vertices are looked for in one group at a time. (Different groups may have the same
+            number: callers check.) ``None`` if there is only one.
     """
 
     def __init__(
@@ -86,14 +86,14 @@ class VertexGrid:
     @property
     def occupancy(self) -> float:
         """The number of other vertices in a cube around a vertex, two radii wide, on average over
-        the vertices; of a grid of few vertices, as buckets stand for cells."""
+        the vertices. The grid must have few vertices, because buckets are counted as cells."""
         counts = mi.Float64(self._cubes())
         total, squares = dr.sum(counts), dr.sum(dr.square(counts))
         return float((squares / dr.maximum(total, 1))[0]) - 1
 
     @property
     def median_occupancy(self) -> float:
-        """As :attr:`occupancy`, the median over the vertices."""
+        """Like :attr:`occupancy`, but the median over the vertices."""
         counts = np.sort(self._cubes().numpy())
         vertices = np.cumsum(counts)
         return float(counts[np.searchsorted(vertices, 0.5 * vertices[-1])]) - 1
@@ -183,5 +183,5 @@ def _hash(cell: mi.Vector3i, group: mi.UInt32) -> mi.UInt32:
 
 
 def _tag(hashed: mi.UInt32) -> mi.UInt32:
-    """A bit of 32 that tells rows of cells apart that share buckets."""
+    """One of 32 bits, which distinguishes rows of cells that share buckets."""
     return mi.UInt32(1) << (hashed >> 27)

@@ -195,9 +195,9 @@ def _distance(number: mi.UInt32, sample: mi.Float, scattered: mi.Float, σ: mi.F
 def suitable_ball(
     scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, footprint: float, pixels: int
 ) -> float | None:
-    """The radius in which a ball holds a handful of the vertices of one light path per pixel: the
-    median over the vertices in media, since they are dense without bounds near small lamps.
-    Measured by a few light paths; ``None`` if these leave too few vertices in media.
+    """The radius in which a ball holds ``PHOTONS_PER_DISK`` vertices, with one light path per
+    pixel: the median over the vertices in media, because their density near small lamps has no
+    bound. A few light paths measure it. ``None`` if they leave too few vertices in media.
 
     Parameters:
         light_walk: Traces the light paths.

@@ -1,5 +1,5 @@
-"""Directions of the final gather that follow the photons: half of the segments go to where photons
-near the vertex have come from.
+"""Directions of the final gather that follow the photons: half of the segments go in directions
+from which photons near the vertex have come.
 
 Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH course,
 2004, section 10.5 ("final gather"); H. W. Jensen, *Importance Driven Path Tracing Using the Photon
@@ -118,8 +118,8 @@ class PhotonDirections(Scattering):
     def _photon(
         self, vertex: Vertex, other: LightVertex, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float]:
-        """Where a photon has come from (local at ``vertex``), and its power: 0 if it does not
-        count."""
+        """The direction from which a photon has come (local at ``vertex``), and its power, which is
+        0 if it does not count."""
         d = vertex.si.to_local(other.si.to_world(other.si.wi))
         counts = active & (other.depth > 1) & (other.history.scattered != 0)
         counts &= d.z * vertex.si.wi.z > 0
