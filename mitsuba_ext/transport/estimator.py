@@ -67,7 +67,7 @@ class Sample:
         valid: Whether the path hit a surface that scattered it (or the visible environment); this
             becomes alpha. ``L`` need not be zero elsewhere: a null surface may be lit.
         scatter_count: Rays traced in directions that a BSDF chose.
-        shadow_count: Shadow rays traced. Counts are arrays of any width, of which the sum matters.
+        shadow_count: Shadow rays traced. Counts are arrays of any width; only their sum matters.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
             for each of them.
         aovs: Values of arbitrary output variables, if the estimator finds any.

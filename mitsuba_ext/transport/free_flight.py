@@ -106,7 +106,7 @@ def track(
         chosen = component(σ, channel)
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint
         weight = attenuation(σ - chosen, flown) * dr.select(is_inside, dr.rcp(chosen), 1)
-        # Is the collision a real one?
+        # Whether the collision is real
         passing = channel_mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
         is_null = is_inside & (sampler.next_1d(is_inside) < passing)
         is_real = is_inside & ~is_null

@@ -60,10 +60,11 @@ from ..startup import registry
 from ..startup.garbage import garbage_left_alone
 from .call_description import VALUES, CallDescription, UndescribedError, address
 
-#: The largest number of scenes whose recordings are kept, and of recordings of each.
+#: The largest number of scenes whose recordings are kept, and of recordings of each scene.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 
-#: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
+#: Parts of Dr.Jit's messages when it cannot record (the second one on a GPU, where memory is
+#: copied).
 _OF_RECORDING = "frozen function", "record(): "
 
 
@@ -125,7 +126,7 @@ class _Process:
 
     Attributes:
         lock: Held while recordings are used.
-        threads: Those that have rendered.
+        threads: The threads that have rendered.
         scenes: The recordings of each scene.
     """
 
@@ -142,7 +143,7 @@ T = TypeVar("T")
 
 def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) -> T:
     """Calls ``act``, which renders ``scene``: frozen functions use what was recorded in earlier
-    renders of it. If Dr.Jit cannot record one of them, ``act`` begins anew, without recordings."""
+    renders of it. If Dr.Jit cannot record one of them, ``act`` starts over, without recordings."""
     with _process.lock:
         _process.threads.add(threading.current_thread())
     with _nothing_left_waiting():
@@ -151,7 +152,7 @@ def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) ->
             with _state(current, _thread.is_forbidden):
                 return act()
         except NotRecordableError as reason:
-            mi.Log(mi.LogLevel.Info, f"the render begins anew, without recordings: {reason}")
+            mi.Log(mi.LogLevel.Info, f"the render starts over, without recordings: {reason}")
         with _state(None, True):
             return act()
 
@@ -186,7 +187,7 @@ def forget_recordings() -> None:
 
 
 def frozen(function: Callable | None = None, *, any_width: bool = False) -> Callable:
-    """Decorates a function, or a method, that is to be frozen.
+    """Decorates a function, or a method, that should be frozen.
 
     Parameters:
         any_width: Whether its kernels are right for arguments of any width.
@@ -363,7 +364,7 @@ class _Recording:
     def __call__(self, args: tuple, arrays: list[Any]) -> Any:
         self._args = args
         try:
-            # The garbage collector may free memory of NumPy, at which Dr.Jit ends the process
+            # The garbage collector may free memory of NumPy, which makes Dr.Jit end the process
             with garbage_left_alone():
                 return self._frozen(arrays)
         except RuntimeError as error:

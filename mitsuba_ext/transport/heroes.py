@@ -95,7 +95,7 @@ class Heroes:
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
     ) -> mi.Spectrum:
-        """The value of a BSDF by which the throughput is to be multiplied for a connection."""
+        """The value of a BSDF that multiplies the throughput for a connection."""
         if not self._is_needed:
             return bsdf_value
         return self._collapse(bsdf_value, self._refracts(bsdf, si, wo), is_alone)
@@ -111,8 +111,8 @@ class Heroes:
         """The weight of a BSDF sample.
 
         Returns:
-            The weight by which the throughput is to be multiplied; the factor in it that makes up
-            for the lost wavelengths, by which Russian roulette must divide; and the new state.
+            The weight that multiplies the throughput; the factor in it that compensates for the
+            lost wavelengths, by which Russian roulette must divide; and the new state.
         """
         if not self._is_needed:
             return bsdf_weight, 1.0, is_alone
@@ -123,9 +123,9 @@ class Heroes:
         return weight, dr.select(refracts & ~is_alone, self._factor, 1), is_alone | refracts
 
     def join(self, one: tuple, other: tuple) -> mi.Spectrum:
-        """The product of the values of two BSDFs, of vertices of two paths that are connected, by
-        which both throughputs are to be multiplied. Each vertex is given as the state of its path,
-        and ``bsdf_value``, ``bsdf``, ``si``, ``wo`` of :meth:`connect`."""
+        """The product of the BSDF values at the two vertices at which two paths are connected. It
+        multiplies both throughputs. Each vertex is given as the state of its path, and
+        ``bsdf_value``, ``bsdf``, ``si``, ``wo`` of :meth:`connect`."""
         value = one[1] * other[1]
         if not self._is_needed:
             return value

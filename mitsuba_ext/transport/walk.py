@@ -126,7 +126,7 @@ class Walk:
             hero_is_alone=heroes.begin(),
             history=self.program.begin(ray),
         )
-        valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
+        valid = mi.Bool(sees_environment and self.max_depth > 0)  # Whether it has met anything
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
         active = mi.Bool(active) & (self.max_depth > 0)
         directions_state = self.directions.begin(sampler, ray, pixel)

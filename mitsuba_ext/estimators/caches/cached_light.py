@@ -1,9 +1,9 @@
 """Camera paths that end at cached irradiance.
 
-Up to the first vertex at which a *diffuse lobe* is sampled, a camera path is one of ``path``.
-There, the cache gives the irradiance of indirect light. One more segment finds direct light, as in
-``path``, and the path ends where it hits. Where no record is valid, the path goes on as one
-of ``path``.
+Up to the first vertex at which a *diffuse lobe* is sampled, a camera path is the same as in
+``path``. There, the cache gives the irradiance of indirect light. One more segment finds direct
+light, as in ``path``, and the path ends where this segment ends. Where no record is valid, the path
+goes on as in ``path``.
 
 The lobe is the one that the BSDF says it has sampled. The other lobes go on as in ``path``: this is
 the balance heuristic between lobes, so the part of the diffuse lobe has no highlight.
@@ -19,9 +19,9 @@ import mitsuba as mi
 from ...transport.path_program import EndingProgram, PathProgram
 from .record_grid import RecordGrid
 
-#: The parts of a camera path that has not met the cache: it has been scattered by mirrors and clear
-#: glass at most; by glossy lobes too. Then, it has left the vertex at which it met the cache; or it
-#: is over.
+#: The phases of a camera path. Before it asks the cache: only mirrors and clear glass have
+#: scattered it; or glossy lobes have scattered it, too. Afterwards: it has just left the vertex at
+#: which it asked the cache; or it is over.
 SHARP, BLURRED, LEAVES, ENDED = range(4)
 
 
@@ -30,7 +30,7 @@ class Progress:
     """The history of a camera path.
 
     Attributes:
-        phase: Which part of the path this is (:data:`SHARP`, …).
+        phase: The phase of the path (:data:`SHARP`, …).
         length: The length of the path from the camera to the vertex.
     """
 
@@ -40,8 +40,8 @@ class Progress:
 
 class CachedPaths(EndingProgram):
     """Weighs light as ``path`` does up to the vertex that asks the cache, and light that reaches
-    this vertex directly. All other light comes from the cache. Ends a path in the phase that is
-    over; before that, it decides as ``path`` does.
+    this vertex directly. All other light comes from the cache. Ends a path in the phase
+    :data:`ENDED`; before that, it decides as ``path`` does.
 
     Parameters:
         max_depth: Longest path in segments.

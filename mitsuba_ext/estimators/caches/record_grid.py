@@ -36,7 +36,7 @@ class RecordGrid:
         least = float(radius.min()) if count else 1.0
         level = np.floor(np.log2(np.maximum(radius / least, 1)) + 1e-9).astype(np.int64)
         level = np.minimum(level, _MOST_LEVELS - 1)
-        # Radii of level 0 are up to 2 · least; a little wider, as kernels round otherwise
+        # Radii of level 0 are up to 2 · least; a little wider because kernels round differently
         width = 2.01 * least
         self._width = dr.opaque(mi.Float, width)
         self._levels = dr.opaque(mi.UInt32, int(level.max()) + 1 if count else 0)
@@ -159,7 +159,7 @@ def _sorted(
     for corner in np.ndindex(3, 3, 3):
         cell = low + corner
         way = (cell + 0.5) * widths[:, None] - p
-        # Does the cell touch the cube around the record, and the layer at its tangent plane?
+        # Whether the cell touches the cube around the record, and the layer at its tangent plane
         touches = (np.abs(way) <= (radius + 0.5 * widths)[:, None]).all(axis=1)
         half = 0.505 * widths * np.abs(n).sum(axis=1)
         touches &= np.abs((way * n).sum(axis=1)) <= _BESIDE * radius + half

@@ -32,7 +32,7 @@ class Places:
         p: Position: [place, 3].
         n: Shading normal, on the side whose hemisphere counts.
         geometric: Geometric normal, on either side.
-        footprint: The width of a pixel there, as the camera sees it: [place].
+        footprint: The width of a camera pixel at the place: [place].
     """
 
     p: np.ndarray

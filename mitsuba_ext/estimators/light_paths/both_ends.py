@@ -23,7 +23,7 @@ def from_both_ends(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 
 class FromBothEnds(EmitterSampling):
-    """Passes vertices to a next event decision as :func:`from_both_ends` changes them.
+    """Applies :func:`from_both_ends` to the vertices that a next event decision receives.
 
     A decision may distinguish the two sides of a surface. A camera path and a light path reach the
     vertex from different directions, and from different sides if the surface transmits. The MIS

@@ -39,7 +39,7 @@ class EmitterTable:
     """
     Parameters:
         pieces: The pieces of the emitters.
-        density: Of each emitter, the density of the position.
+        density: For each emitter, the density of the position.
         is_delta_direction: Which emitters have only one direction.
         emitters: The emitters.
     """

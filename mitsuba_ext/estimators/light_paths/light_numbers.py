@@ -18,7 +18,7 @@ class LightPathRays:
     Attributes:
         count: Number of light paths.
         numbers: Their random numbers.
-        time, wavelengths: Of each path.
+        time, wavelengths: Time and wavelengths of each path.
     """
 
     count: int

@@ -101,9 +101,9 @@ class LightVertex:
     """A stored vertex, in each lane.
 
     Attributes:
-        si: The interaction there. ``wi`` points to where the light path came from.
+        si: The interaction there. ``wi`` points towards the previous vertex of the light path.
         β: Radiance · throughput / density of the path up to the vertex.
-        history: What the :class:`LightProgram` knows of the path up to the vertex.
+        history: What the :class:`LightProgram` knows about the path up to the vertex.
         depth: Segments between the light and the vertex; at least 1.
         hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
             light.
@@ -270,7 +270,8 @@ class VertexCache(PackedVertices):
         lanes: Number of paths.
 
     Attributes:
-        first, number (mi.UInt32): Of each path: index of its first vertex, and how many it has.
+        first, number (mi.UInt32): The index of each path's first vertex, and its number of
+            vertices.
     """
 
     def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
@@ -317,7 +318,7 @@ class VertexCache(PackedVertices):
 
 
 def group_of(time: mi.Float, wavelengths: mi.Spectrum) -> mi.UInt32:
-    """A number that paths of the same time and the same wavelengths have in common."""
+    """A number that is the same for all paths with the same time and wavelengths."""
     word = dr.reinterpret_array(mi.UInt32, mi.Float(time)) * 0x27D4EB2F
     if mi.is_spectral:
         word ^= dr.reinterpret_array(mi.UInt32, wavelengths[0]) * 0x165667B1

@@ -1,4 +1,4 @@
-"""BSDFs at vertices of light paths, evaluated such that light paths and ``path`` have the same
+"""BSDFs at vertices of light paths, evaluated so that light paths and ``path`` have the same
 integrand.
 
 ``path`` evaluates BSDFs with ``wi`` towards the camera. Some are not reciprocal (normal and bump
@@ -69,11 +69,12 @@ def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Flo
 
 
 def cosine_of_delta(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
-    """What ratios of densities hold instead of the cosine of a direction from a delta lobe.
+    """The factor that replaces the cosine in ratios of densities, for a direction from a delta
+    lobe.
 
     The densities with which two techniques pass the vertex, in one direction and in the other, are
     per solid angle. Étendue, η² · cosine · solid angle · area, is the same on both sides of an
-    interface, so that their ratio changes by η² (Veach, PhD thesis, section 5.2).
+    interface, so their ratio changes by η² (Veach, PhD thesis, section 5.2).
     """
     return geometric_cosine(si, si.wi) / dr.square(bs.eta)
 

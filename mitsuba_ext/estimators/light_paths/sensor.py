@@ -114,7 +114,7 @@ class ConnectableSensor:
 
     def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:
         """The point of the aperture from which a camera ray comes (the ray itself begins at the
-        near clip plane), and the density of its direction, as :attr:`SensorConnection.pdf`.
+        near clip plane), and the density of its direction, like :attr:`SensorConnection.pdf`.
         """
         axis = viewing_axis(self._sensor, ray.time)
         inverse = dr.rcp(dr.maximum(dr.dot(ray.d, axis), 1e-6))

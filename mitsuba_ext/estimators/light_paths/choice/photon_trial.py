@@ -241,8 +241,8 @@ class _Samples(TechniqueObserver):
 
     Attributes:
         passes: The values of each pass, [sample, pixel].
-        hidden: Of each pass, the second moments of camera paths that hit hidden lights, and the
-            light that these cannot find, [2, sample, pixel].
+        hidden: For each pass, the second moments of camera paths that hit hidden lights, and the
+            light that camera paths cannot find, [2, sample, pixel].
         counts: What takes time, in all of them.
     """
 

@@ -30,7 +30,8 @@ class PredictedErrors:
 
     Attributes:
         variances: The expected squared error of a render of this length. Light that a candidate
-            cannot find counts as missing, by its square; so does what hardly any render finds.
+            cannot find counts as missing, by its square; so does light that hardly any render
+            finds.
         trimmed: The same, without the brightest contributions, which one pixel in a thousand holds.
         long_run: The variance: the error of long renders. It is infinite for a candidate that
             cannot find some light; if ``path`` cannot, it is 0 for all others.

@@ -43,10 +43,10 @@ BATCH = 4
 PILOT_PATHS, DOUBLINGS = 1 << 16, 8
 
 #: The number of photons that a disk should hold. MIS weights count this number of photons as one
-#: sample: they share a camera path, and other techniques often vary less than their densities
-#: suggest. (With weights that count each photon, the variance is 1.1 to 1.2 times as large in
-#: glass_lamp, pool and caustic; if they count fewer than a tenth of the photons, it stays about the
-#: same.)
+#: sample: photons of a disk share a camera path, and other techniques often vary less than their
+#: densities suggest. (With weights that count each photon, the variance is 1.1 to 1.2 times as
+#: large in glass_lamp, pool and caustic; if they count fewer than a tenth of the photons, it stays
+#: about the same.)
 PHOTONS_PER_DISK = 8.0
 
 #: The least number of vertices that the measuring light paths must leave: with fewer, nothing is

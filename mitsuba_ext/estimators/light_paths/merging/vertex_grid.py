@@ -67,8 +67,9 @@ class VertexGrid:
         packet = mi.Vector4f(p.x, p.y, p.z, dr.reinterpret_array(mi.Float, index))
         dr.scatter(self._sorted, packet, place, active)
         self._total = dr.gather(mi.UInt32, ends, buckets - 1)
-        # Of each bucket, the range of places from its first vertex to the last one of the buckets
-        # that a ball overlaps, and the tags of their cells. Behind the last bucket comes the first
+        # For each bucket, the range of places from its first vertex to the last vertex of the
+        # buckets that a ball overlaps, and the tags of their cells. The first bucket follows the
+        # last one
         first = dr.arange(mi.UInt32, buckets)
         last = first + _PER_DIAMETER
         end = dr.gather(mi.UInt32, ends, last & self._mask)

@@ -132,7 +132,7 @@ class LearnedChoice:
 
 
 def _measured(lights: VirtualLights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The flux that each virtual light emits, as :func:`emitted_flux`; the brightness of what it
+    """The flux that each virtual light emits (:func:`emitted_flux`); the brightness of what it
     receives; and its region, 0 where there are no regions."""
     vertices = lights.vertices
     # Rounded up, so that passes share a recording
@@ -191,7 +191,7 @@ def _slots(flux: np.ndarray, number: np.ndarray, room: int) -> tuple[np.ndarray,
         part = flux[first : first + size]
         total = part.sum()
         share = part / total if total > 0 else np.full(size, 1 / size)
-        # Rounded such that all numbers add up
+        # Rounded so that all numbers add up
         edges = np.rint(np.cumsum(share) * (_SLOTS - 1) * size)
         edges[-1] = (_SLOTS - 1) * size
         count[first : first + size] = 1 + np.diff(edges, prepend=0)

@@ -21,7 +21,7 @@ MOST_PATHS, _SAMPLES_PER_PATH = 1 << 21, 4
 class Sets:
     """How the samples of a pass share sets of virtual lights: the first samples of all pixels have
     one set, the second ones another, and so on. If sets are interleaved, neighbouring pixels have
-    different ones.
+    different sets.
 
     Attributes:
         pixels: Number of pixels of the film.
@@ -67,7 +67,7 @@ class VirtualLights:
 
     Attributes:
         scene, vertices, set_count: The parameters.
-        begin, number (mi.UInt32): Of each set: its first vertex, and how many it has.
+        begin, number (mi.UInt32): The first vertex of each set, and its number of vertices.
         share (mi.Float): 1 / number of light paths of a set.
     """
 
