@@ -14,7 +14,7 @@ import numpy as np
 #: Values that are their own description.
 VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
-#: Sensors of Mitsuba 3.9.1 that hold arrays which they do not report to Dr.Jit.
+#: Sensors of Mitsuba 3.9.1 that hold arrays but do not report them to Dr.Jit.
 SENSORS_WITH_HIDDEN_ARRAYS = frozenset({"ThinLensCamera", "OrthographicCamera"})
 
 

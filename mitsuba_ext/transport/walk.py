@@ -47,8 +47,7 @@ class Walk:
     Parameters:
         max_depth: Longest path in segments; 1 shows emitters only, 2**32 − 1 stands for no limit.
         rr_depth: Depth at which Russian roulette begins.
-        hide_emitters: Whether camera rays pass through area lights, and the environment is
-            invisible.
+        hide_emitters: Whether camera rays pass through area lights, and do not see the environment.
         directions: Draws the primary samples that choose the lobe and the direction of a BSDF
             sample.
         scattering: Chooses the direction in which a path continues.

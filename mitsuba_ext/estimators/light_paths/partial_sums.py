@@ -86,8 +86,8 @@ class PartialSums:
             ``None`` if vertices are not merged.
         merges_all: Whether vertices are merged wherever their BSDF is smooth. If not, they are
             merged only where light arrives from a delta lobe.
-        light_paths: Number of light paths for each camera path. It is also the number of light
-            paths, per camera path, that are connected to the sensor (t = 1).
+        light_paths: Number of light paths for each camera path: the number of samples of the
+            technique that connects light paths to the sensor (t = 1).
         has_clear_curves: Whether light passes through a curve (``scene/bsdfs.py``).
     """
 

@@ -106,7 +106,7 @@ class BidirectionalPathTracer:
         per_camera_path = light.count / lanes
         radius, merging = None, None
         if self.radius is not None:
-            # If times or wavelengths differ, only the paths of sample k of each pixel merge
+            # If times or wavelengths differ, paths merge only with the same sample of other pixels
             paths = min(lanes, self.radius.pixels) if own_lane else light.count
             radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)

@@ -312,8 +312,8 @@ class TrialPasses:
 
 
 def _ratio(of_photons: np.ndarray, of_path: np.ndarray) -> tuple[float, float]:
-    """The variance of photons divided by the variance of camera paths, both given for each pixel;
-    and the standard error of its logarithm."""
+    """The variance of photons divided by the variance of camera paths, and the standard error of
+    the logarithm of this ratio. Both variances are given for each pixel."""
     less, error = gain_of(trimmed_batches(of_photons, of_path - of_photons))
     return max(1 - less, 1e-6), error
 

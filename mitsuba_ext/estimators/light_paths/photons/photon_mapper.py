@@ -122,7 +122,7 @@ class PhotonMapper:
 
     def _merged(self, scene: mi.Scene, vertices: VertexCache, count: int) -> MergedSubpaths:
         """Adds the light of photons, from ``count`` light paths, to camera paths."""
-        # If times or wavelengths differ, only the paths of sample k of each pixel merge
+        # If times or wavelengths differ, paths merge only with the same sample of other pixels
         groups = mi.is_spectral or bool(movers(scene))
         group = vertices.group if groups else None
         paths = min(count, self.radius.pixels) if groups else count
