@@ -20,7 +20,7 @@ class CameraRays:
         importance: The sensor's importance, a factor of the radiance along the ray.
         position: Where on the film (in pixels) the result is added.
         weight: Importance weight of a sample; 1.0 where all count the same.
-        hero_weight: A further factor, for paths of which only the first wavelength is left
+        hero_weight: A further factor, for paths on which only the first wavelength is left
             (``heroes.py``). The estimator applies it.
         medium: The participating medium in which the rays begin; ``None`` in a vacuum.
         distance: The primary sample that chooses the first distance in a homogeneous medium;

@@ -80,7 +80,7 @@ def _close_pairs(places: Places, spacing: np.ndarray) -> np.ndarray:
         lists = tree.query_ball_point(places.p[own], spacing[own])
         first = np.repeat(own, [len(near) for near in lists])
         second = np.concatenate([np.asarray(near, int) for near in lists])
-        # The other one's spacing is not smaller: its own octave finds those
+        # Keeps pairs whose second place has no smaller spacing: its octave finds all others
         keeps = (spacing[second] > spacing[first]) | (
             (spacing[second] == spacing[first]) & (second > first)
         )

@@ -369,7 +369,7 @@ class LightEmission:
         return dr.select(way == float(pieces.TO_BOTH_SIDES), both, front)
 
     def _weighing_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
-        """Like :meth:`_cosine_density`, but for MIS weights: see :meth:`densities`."""
+        """Like :meth:`_cosine_density`, for MIS weights: see :meth:`densities`."""
         is_smooth = self.has_smooth_meshes & (way == float(pieces.TO_BOTH_SIDES))
         return self._cosine_density(dr.select(is_smooth, dr.abs(cosine), cosine), way)
 

@@ -68,7 +68,7 @@ class VisibilityLens(UniformLens):
     piece of the aperture. These are never zero, so the estimate is unbiased even where the maps are
     wrong.
 
-    A piece of which the fraction v is visible has a probability proportional to √v. If it is chosen
+    If the fraction v of a piece is visible, its probability is proportional to √v. If it is chosen
     with the probability q, it contributes v / q to the second moment of the estimate. The sum of
     these is smallest with √v.
 

@@ -29,8 +29,8 @@ _PLAIN_TEXTURES = (
     "IrregularSpectrum",
 )  # fmt: skip
 
-#: Words of the fields that all BSDFs read, and of those that only some read; and which of them
-#: holds the shape: 0 for an interaction in a medium.
+#: Words of the fields that all BSDFs read, and of the fields that only some BSDFs read; and which
+#: word holds the shape: 0 for an interaction in a medium.
 _WORDS, _MORE_WORDS, SHAPE_WORD = 15, 14, 14
 
 

@@ -25,7 +25,7 @@ class MovingSceneQuery(SceneQuery):
 
     Parameters:
         scene: The static scene.
-        moving: The movers, as from :func:`movers`.
+        moving: The movers, from :func:`movers`.
         starts: Where rays that leave a surface start.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""A hash grid of the stored vertices of light paths, which finds those near a point."""
+"""A hash grid of the stored vertices of light paths, which finds the vertices near a point."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from ....transport.heroes import Heroes
 from ....transport.path_program import EndingProgram, Subpaths
 from ....transport.vertex import Arrival, PathState, Vertex
 
-#: The phases of a camera path, by what it has left behind: no diffuse vertex; the first one, just
-#: now; the first one, and others that are not diffuse; two diffuse vertices.
+#: The phases of a camera path, by the vertices that it has left: no diffuse vertex; the first
+#: diffuse vertex, just now; the first one, and then others that are not diffuse; two diffuse ones.
 BEFORE, GATHERS, GATHERS_ON, ENDED = range(4)
 
 

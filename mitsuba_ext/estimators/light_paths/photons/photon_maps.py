@@ -85,7 +85,7 @@ class PhotonMaps:
             light_walk: Traces the light paths; see :func:`photon_walk`.
             paths: Number of light paths.
             final_gather: See :class:`PhotonSubpaths`.
-            radii: Radii of the maps of caustics and of all light; 0 for those that suit the
+            radii: Radii of the maps of caustics and of all light; 0 for a radius that suits the
                 photons.
             lookup_size: Number of photons that an estimate should use.
             least: See :func:`disk_radius`; 0 for one that suits the scene.
