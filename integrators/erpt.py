@@ -197,5 +197,5 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     def parameters(self) -> dict[str, Any]:
         shown = super().parameters()
-        # With mutations of paths, those of primary samples have no effect
+        # With mutations of paths, mutations of primary samples have no effect
         return {k: v for k, v in shown.items() if not (self.has_paths and k in _PRIMARY)}

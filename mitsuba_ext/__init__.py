@@ -29,7 +29,7 @@ if not (_folder / "integrators").is_dir():
     if not (_folder.parent / "integrators").is_dir():
         raise ImportError(
             f"mitsuba_ext finds none of its plugins: {_folder} must be a folder that `pip install` "
-            "made, or that of the sources (not inside of a zip archive)."
+            "made, or the folder of the sources (not inside of a zip archive)."
         )
     __path__.append(str(_folder.parent))
 

@@ -20,7 +20,7 @@ class AreaLuminaire(mi.Emitter):
     Mitsuba's ``area``.
 
     Attributes:
-        is_projected: Are polygons sampled by projected solid angle?
+        is_projected: Whether polygons are sampled by projected solid angle.
     """
 
     is_projected = False

@@ -55,7 +55,7 @@ class LightPathIntegrator(WalkIntegrator):
     connections, light_image, sample_direct, technique_images = 1, True, True, ""
     #: Where vertices are merged; ``None`` if they are not.
     merging: MergingParameters | None = None
-    #: Are all vertices merged, or only those to which light comes from a delta lobe?
+    #: Whether all vertices are merged, or only vertices to which light comes from a delta lobe.
     merges_all = False
     #: What a render uses if no decision says that.
     techniques_by_default = Candidate(1.0, merges=True)
@@ -255,7 +255,7 @@ class Once:
 
 
 def _most_lanes(light_paths: float) -> int:
-    """The most camera paths in a pass, with so many light paths for each."""
+    """The most camera paths in a pass, with this number of light paths for each."""
     layout = Layout(len(mi.Spectrum()), StoredSums(5), True)
     bytes_per_path = STRIDE * bytes_per_vertex(layout) + _LIGHT_BYTES
     return int(_PASS_BYTES / (light_paths * bytes_per_path + _CAMERA_BYTES))

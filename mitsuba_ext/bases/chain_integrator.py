@@ -71,7 +71,7 @@ class ChainIntegrator(WalkIntegrator):
          are saved to it in the end, also after Ctrl-C or a time limit. If it exists, the same
          render (scene, sensor, seed, parameters) continues from it, up to ``spp``, which may be
          higher than before. Where chains find the whole image (:class:`pssmlt`, :class:`mlt`), the
-         estimate of its mean brightness is that of the first render. (Default: none)
+         estimate of its mean brightness is taken from the first render. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,

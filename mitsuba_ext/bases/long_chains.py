@@ -25,8 +25,8 @@ class LongChains:
         chains: Number of chains; 0 for a number that suits the render.
         luminance_samples: Least number of samples that estimate the brightness of the image.
         p_large: The probability of a mutation that does not depend on the state of the chain.
-        two_stage: Does a first stage make the visits even over the film?
-        uses_uniform: Are large steps also used as independent samples?
+        two_stage: Whether a first stage makes the visits even over the film.
+        uses_uniform: Whether large steps are also used as independent samples.
         steps: The small steps of primary samples.
     """
 

@@ -29,14 +29,14 @@ class MetropolisIntegrator(ChainIntegrator):
      * - next_event
        - |string| or |decision|
        - How points on lights are chosen, as in :class:`composed_path`. Choices that learn are not
-         accepted. (Default: that of :monosp:`path`)
+         accepted. (Default: as in :monosp:`path`)
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
          hide_emitters, timeout, aovs, checkpoint.
 
     Attributes:
-        bidirectional: Do chains sample paths from both ends?
+        bidirectional: Whether chains sample paths from both ends.
         is_bidirectional: The default of ``bidirectional``.
     """
 

@@ -70,7 +70,7 @@ class SensitivePath(RememberingPath):
         spp = spp or sensor.sampler().sample_count()
         # Pilots are three quarters of the samples
         samples = min(4 * self._pilot_spp // 3 + 1, spp * (self.learn_every or 16) // 4)
-        # Other random numbers than those of the pass that uses what is learned
+        # Not the random numbers of the pass that uses what is learned
         seed = int((mi.UInt32(seed) + 0x9E3779B9)[0])
         request = Request(
             scene, sensor, seed, max(4, samples), develop=False, timeout=self.timeout,

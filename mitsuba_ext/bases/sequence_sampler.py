@@ -41,7 +41,7 @@ class SequenceSampler(mi.Sampler):
 
     Attributes:
         sequence: The point sequence. The plugin sets it.
-        blue_noise: Do pixels share a sequence? Only for sequences whose aligned ranges of 2^k
+        blue_noise: Whether pixels share a sequence. Only for sequences whose aligned ranges of 2^k
             points are well distributed.
     """
 
@@ -89,8 +89,8 @@ class SequenceSampler(mi.Sampler):
         self._values.update(blue_noise=self.blue_noise, film_width=width)
 
     def set_film(self, width: int | None, first: int = 0) -> None:
-        """Sets which pixels the lanes stand for when the sampler is seeded: those of a film, row by
-        row.
+        """Sets which pixels the lanes stand for when the sampler is seeded: the pixels of a film,
+        row by row.
 
         Parameters:
             width: Pixels of a row. 0 if lanes do not stand for pixels, which turns off blue noise.

@@ -104,7 +104,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     @property
     def sample_cost(self) -> int:
-        """The approximate time of a sample in units of that of a path: passes take fewer samples
+        """The approximate time of a sample relative to a path: passes take fewer samples
         if it is larger."""
         return 1
 

@@ -74,9 +74,9 @@ class WalkIntegrator(StagedIntegrator):
     ``keep_learned``; see :class:`composed_path`.
 
     Attributes:
-        has_light_paths (bool): Does it trace light paths besides camera paths?
-        sees_media (bool): Does it render participating media? If not, it refuses them.
-        light_paths_see_media (bool): Do its light paths, if it has any, scatter in them?
+        has_light_paths (bool): Whether it traces light paths besides camera paths.
+        sees_media (bool): Whether it renders participating media. If not, it refuses them.
+        light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
     """
@@ -103,8 +103,8 @@ class WalkIntegrator(StagedIntegrator):
     def reader(
         self, props: mi.Properties, names: Mapping[str, str] | None = None, **defaults: Any
     ) -> ParameterReader:
-        """Reads the parameters of a decision from those of the integrator. ``names`` are the
-        integrator's names where they differ, ``defaults`` the integrator's own defaults."""
+        """Reads the parameters of a technique from the parameters of the integrator. ``names`` are
+        the integrator's names where they differ, ``defaults`` the integrator's own defaults."""
         return ParameterReader(self.name, props, names, **defaults)
 
     def fill(self, props: mi.Properties, **slots: Technique | None) -> None:

@@ -41,13 +41,13 @@ class WrappingIntegrator(StagedIntegrator):
     # ---- What a subclass overrides ----
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
-        """Can this integrator be nested?"""
+        """Whether this integrator can be nested."""
         return True
 
     # ---- What a subclass calls ----
 
     def is_of_this_kind(self, nested: mi.SamplingIntegrator) -> bool:
-        """Is the nested integrator an instance of the subclass?"""
+        """Whether the nested integrator is an instance of the subclass."""
         # Not by the module's name: once another variant is selected, that is another class
         return isinstance(nested, type(self))
 

@@ -34,7 +34,7 @@ class AdaptiveJob(Job):
     pixel. For later passes, :class:`SampleAllocation` computes the number of each pixel.
     """
 
-    divides_stages = False  # moments are those of whole passes
+    divides_stages = False  # moments are computed from whole passes
 
     def __init__(self, integrator, request: Request) -> None:
         if request.sensor.sampler().class_name() == "StratifiedSampler":

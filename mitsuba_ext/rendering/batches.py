@@ -29,7 +29,7 @@ class Batches:
     do not grow with the number of batches.
 
     Attributes:
-        channels: Names of the channels: those of the film's image, then the integrator's AOVs.
+        channels: Names of the channels: the film's image, then the integrator's AOVs.
         image_channel_count: Number of channels of the image, alpha included.
         spp: Samples per pixel of all batches together.
     """

@@ -46,7 +46,7 @@ def first_pixel(film: mi.Film) -> tuple[int, int]:
 
 def tell_film(sampler: mi.Sampler, film: mi.Film, first: int = 0) -> None:
     """Tells a sampler which pixels its lanes stand for, if it has the method ``set_film`` (as
-    ``sobol_owen``): those of the film row by row, from index ``first`` on."""
+    ``sobol_owen``): the pixels of the film row by row, from index ``first`` on."""
     if hasattr(sampler, "set_film"):
         sampler.set_film(film_extent(film)[0], first)
 

@@ -17,8 +17,8 @@ class FilmSums:
 
     Attributes:
         contents: The sums, [height, width, channel], in double precision; 0.0 before the first.
-        has_weights: Does the film hold weights? A light tracer leaves an image without weights: the
-            images are then added, each times its samples per pixel.
+        has_weights: Whether the film holds weights. A light tracer leaves an image without
+            weights: the images are then added, each times its samples per pixel.
         spp: Samples per pixel of all renders.
     """
 
@@ -30,7 +30,7 @@ class FilmSums:
         """Adds the contents of the film after a render of ``spp`` samples per pixel.
 
         Args:
-            counts_samples: Do the film's weights count the samples of the image?
+            counts_samples: Whether the film's weights count the samples of the image.
         """
         contents = np.array(film.develop(raw=True), dtype=np.float64)
         weights = contents[..., _weight_channel(film), None]

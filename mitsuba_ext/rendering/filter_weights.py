@@ -40,7 +40,7 @@ def mean_weights(film: mi.Film) -> np.ndarray:
 
 
 def share_of_squares(film: mi.Film) -> float:
-    """The variance of a pixel, in units of that of the box filter with as many samples of each
+    """The variance of a pixel, relative to the box filter with as many samples of each
     pixel: ∫w² / (∫w)² over the plane, for the filter w. (The film divides by the sum of the weights
     instead of its mean, which lowers the variance further where the image is even.)"""
     edges, values = _table(film.rfilter())

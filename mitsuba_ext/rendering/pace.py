@@ -162,7 +162,7 @@ class PacedJob(Protocol):
 
 
 def plan_for_timeout(job: PacedJob) -> RenderPlan:
-    """The plan of a render, whose pilots are those of a render of as many samples as the time
+    """The plan of a render with the pilots of a render of as many samples as the time
     allows. Renders without a timeout or pilots, of fewer samples than a short pass, or whose passes
     must have the same length, keep their plan."""
     plan, limit, integrator = job.plan, job.limit, job.integrator
@@ -175,7 +175,7 @@ def plan_for_timeout(job: PacedJob) -> RenderPlan:
     while is_new and job.statistics.spp + limit.short < plan.spp:
         begin, before = time.perf_counter(), _tracing(job)
         is_new = job.run_pass(stage, limit.short)
-        # Long passes take no longer to trace than this one: their speed is that of the kernel
+        # Long passes take no longer to trace than this one: their speed is the speed of the kernel
         tracing = _tracing(job) - before
         limit.measure(limit.short, time.perf_counter() - begin - tracing)
         compiling += tracing if is_new else 0.0

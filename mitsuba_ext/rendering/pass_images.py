@@ -7,7 +7,7 @@ import numpy as np
 
 from .filter_weights import mean_weights, share_of_squares, shares_of_pixels
 
-#: A stage whose images are wanted has so many passes or more. A variance needs two images.
+#: The fewest passes of a stage whose images are wanted. A variance needs two images.
 FEWEST_PASSES = 3
 
 

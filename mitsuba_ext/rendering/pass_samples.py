@@ -37,7 +37,7 @@ def put_samples(
         samples: Chooses points of the aperture, times and wavelengths.
         spp: Samples per pixel of the whole render.
         weight: The weight of each sample.
-        tally: Counts of rays, to which those of the pass are added.
+        tally: Counts of rays, to which the rays of the pass are added.
 
     Raises:
         GradientsError: The radiance has gradients.
@@ -58,7 +58,7 @@ def look(
     spp: int,
 ) -> mi.Spectrum:
     """The radiance of samples from which observers learn. They are not added to the film. The
-    parameters, and what is raised, are those of :func:`put_samples`."""
+    parameters, and what is raised, are as for :func:`put_samples`."""
     return _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)[1].L
 
 

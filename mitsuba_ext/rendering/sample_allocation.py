@@ -65,7 +65,7 @@ class SampleAllocation:
 
         Parameters:
             budget: Number of samples of the pass.
-            is_last: Is it the last pass?
+            is_last: Whether it is the last pass.
             share: The fraction of the remaining weight that this pass gets.
         """
         active = self.is_active

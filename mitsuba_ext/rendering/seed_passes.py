@@ -107,7 +107,7 @@ class SeedPasses:
     ) -> None:
         """Renders, and leaves the image of the finished passes in the film, also after an exception
         and after Ctrl-C, which ends the render after the running pass. With a single pass, the
-        image is that of ``integrator.render``.
+        image is the one of ``integrator.render``.
 
         Args:
             spp: Samples per pixel, which structured samplers may round up.

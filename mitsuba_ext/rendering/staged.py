@@ -43,7 +43,7 @@ class Staged(Protocol):
 
         Parameters:
             request: What is rendered.
-            kernels: How many kernels as large as that of ``path`` learning may compile.
+            kernels: How many kernels of the size of ``path`` learning may compile.
         """
 
     def pace_stage(self, request: Request, spp: int) -> Stage | None:

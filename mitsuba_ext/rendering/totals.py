@@ -106,7 +106,7 @@ class RenderTotals:
 
 
 def _is_cost(key: str, value: Any) -> bool:
-    """Can an attribute of :class:`RenderTotals` have this value?"""
+    """Whether an attribute of :class:`RenderTotals` can have this value."""
     if key in _KINDS:
         return isinstance(value, dict) and all(
             kind in _KINDS[key] and _is_number(count) for kind, count in value.items()

@@ -175,7 +175,7 @@ class TreeBuilder:
         tree_count: int,
         expected: mi.UInt32 | None = None,
     ) -> int:
-        """As :meth:`add`, for samples that have been sorted. The trees are those of the numbers
+        """As :meth:`add`, for samples that have been sorted. The trees have the numbers
         from ``first`` on."""
         first_node, self._sorted = self.node_count, samples
         tree = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, tree_count)

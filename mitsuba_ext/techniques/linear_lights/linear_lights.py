@@ -287,8 +287,8 @@ def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
 
 
 def _opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
-    """For each BSDF, by its number in Dr.Jit's registry: does it reflect only light from the side
-    of the shading normal that is seen? Not so for BSDFs that are not found here (those of
+    """For each BSDF, by its number in Dr.Jit's registry: whether it reflects only light from the
+    side of the shading normal that is seen. False for BSDFs that are not found here (in
     instances), and for bump and normal maps, whose normals may face away."""
     transmission = int(mi.BSDFFlags.Transmission)
     opaque = {}

@@ -57,7 +57,7 @@ class Nodes:
 
     def masses(self, left: mi.Float) -> mi.Float:
         """By table and cell, the product of the shares on the way from the root to the cell;
-        ``left`` is that of the left half of each node."""
+        ``left`` is the one of the left half of each node."""
         dr.eval(left)
         lane = dr.arange(mi.UInt32, self._tables * self.cells)
         leaf = (lane & (self.cells - 1)) + self.cells

@@ -61,7 +61,7 @@ class Choices:
     later: mi.Float | float = 0.0
 
     def under(self, q: mi.Float) -> mi.Float:
-        """``density`` if that of the maps, relative to uniform numbers, were ``q``."""
+        """``density`` if the density of the maps, relative to uniform numbers, were ``q``."""
         return q if self.share == 1 else (1 - self.share) + self.share * self.scale * q
 
 
@@ -170,7 +170,7 @@ class TileCounts:
         self._stage_variance += total
 
     def _smooth(self, means: np.ndarray) -> np.ndarray:
-        """The mean radiance of each tile and its neighbours, as that of pixels in
+        """The mean radiance of each tile and its neighbours, as for pixels in
         :mod:`..pixel_estimates`. A rare bright sample would make its own tile bright, so that its
         error would hardly count."""
         image = means.reshape(self._tiles.rows, self._tiles.columns)

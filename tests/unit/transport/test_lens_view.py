@@ -11,6 +11,7 @@ import pytest
 from mitsuba_ext.estimators.defocus.layer_samples import outside_pixels
 from mitsuba_ext.estimators.defocus.layered_job import LayeredJob
 from mitsuba_ext.estimators.light_paths.depth_maps import DepthMaps
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.transport.lens_view import LensView
 from mitsuba_ext.transport.path_decisions import SceneQuery
 from tests.support.stage import area, diffuse, film, sensor
@@ -61,7 +62,7 @@ def test_maps_of_the_lens_and_blurs_of_the_film_have_the_same_depths():
     lens = scene.sensors()[0]
     maps = DepthMaps(scene, lens, SceneQuery(), pieces=2, most_pixels=16)
     integrator = mi.load_dict({"type": "ecoc_dof", "nested": {"type": "path"}})
-    job = LayeredJob(integrator, scene, lens, 0, 1)
+    job = LayeredJob(integrator, Request(scene, lens, 0, 1))
     assert np.allclose(job.lens.blur_at(maps.places.z).numpy(), job.blurs[0, 0], rtol=1e-4)
     assert np.allclose(job.blurs, job.lens.blur(mi.Float(WALL)).numpy(), rtol=1e-4)
 
