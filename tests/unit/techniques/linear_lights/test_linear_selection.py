@@ -315,7 +315,7 @@ def test_one_emitter_needs_no_estimates_and_no_emitter_needs_no_tables():
     selection = LinearChoice(scene)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4)
-    assert selection.begin(sampler, mi.Ray3f()) == ()
+    assert selection.begin(sampler, mi.Ray3f()) is None
     image = batches(_floor(diffuse(), sensor=sensor(), lamp=_panel(0, 0, 1, angle=180)),
                     _integrator(3), 4, [1])  # fmt: skip
     assert image.mean() > 0
