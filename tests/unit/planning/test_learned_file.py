@@ -108,7 +108,7 @@ def test_kept_and_loaded_states_draw_the_same_samples(name, tmp_path: Path) -> N
         kept, loaded = (make(**{key: value}) for key, value in
                         (("keep_learned", True), ("load_learned", file)))  # fmt: skip
         images = [np.array(each.render(scene, seed=5, spp=32)) for each in (kept, loaded)]
-    assert [each.statistics.passes for each in (kept, loaded)] == [1, 1]
+    assert kept.statistics.passes == loaded.statistics.passes <= 8, "neither has pilots"
     np.testing.assert_array_equal(*images)
 
 
