@@ -259,7 +259,7 @@ def test_archive_and_wheel_work_in_another_environment(
     code = """
 import inspect, pathlib, sys
 import mitsuba_ext
-from mitsuba_ext.startup import doctor, plugin_folders
+from mitsuba_ext.startup import doctor, plugin_folders, registry
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 assert pathlib.Path(inspect.getfile(mitsuba_ext)).is_relative_to(sys.prefix)
