@@ -15,8 +15,8 @@ from mitsuba_ext.bases.decision_plugin import register
 from mitsuba_ext.planning.learner import Learner, Pilot
 from mitsuba_ext.planning.technique import Setting, Technique
 from mitsuba_ext.scene.lights.light_cells import LightCells
-from mitsuba_ext.scene.lights.spectra import brightness
 from mitsuba_ext.transport.light_table import LightTable, OneRow
+from mitsuba_ext.util.spectra import brightness
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

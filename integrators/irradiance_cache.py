@@ -25,8 +25,8 @@ from mitsuba_ext.rendering.stages import ReportedSchedule
 from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.scene.movers import refuse_to_share
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.connection import can_be_hit
 from mitsuba_ext.transport.decisions import Decisions
-from mitsuba_ext.transport.emission import can_be_hit
 from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
-from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
+from mitsuba_ext.techniques.guided_directions.decisions import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
 from mitsuba_ext.techniques.guided_directions.parameters import Guided, GuidedRoulette
 from mitsuba_ext.techniques.weighted_points.connections import Connections

@@ -14,11 +14,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..estimators.light_paths.bidirectional_programs import LightSums, StoredSums
 from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_side import LightSide
-from ..estimators.light_paths.light_sums import LightSums, StoredSums
 from ..estimators.light_paths.light_vertices import Layout, bytes_per_vertex
 from ..estimators.light_paths.light_walk import STRIDE, LightWalk
 from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers

@@ -14,7 +14,7 @@ from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
-from ..transport.observer import Observer, Observers
+from ..transport.observer import SCOUT_DEPTH, Observer, Observers, Scout
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
 from ..util.stored_arrays import StoredArrays
@@ -22,7 +22,6 @@ from . import verdicts
 from .costs import LIGHT_PATH_KERNELS
 from .learner import Learner, Pilot
 from .pilots import first_parts, stage_weights
-from .scout import SCOUT_DEPTH, Scout
 from .technique import Setting, Technique
 from .trial import Rival, Trial
 

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..util.arrays import channel_mean, from_numpy
 from . import camera
-from .pass_timer import PassTimer
 from .pixel_moments import PixelMoments
 from .render import Job
 from .request import Request
 from .sample_allocation import SampleAllocation
 from .stages import Stage
+from .statistics import PassTimer
 from .turns import tell
 
 #: By default, each pass takes all samples divided by this number.

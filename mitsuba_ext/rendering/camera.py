@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.colour import to_rgb
 from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
+from ..util.spectra import to_rgb
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -27,12 +27,11 @@ from .interrupts import deferred_interrupt, interrupted
 from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
-from .pass_timer import PassTimer
 from .plan import plan_render
 from .request import Request
 from .staged import Staged
 from .stages import Schedule, Stage
-from .statistics import RenderStatistics
+from .statistics import PassTimer, RenderStatistics
 from .turns import let_others, tell
 
 

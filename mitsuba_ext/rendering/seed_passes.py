@@ -20,8 +20,8 @@ from .camera import film_extent, film_told
 from .film_sums import FilmSums
 from .interrupts import deferred_interrupt
 from .pace import Pace
-from .pass_timer import PassTimer
 from .plan import check_extent, is_independent
+from .statistics import PassTimer
 
 #: Approximate number of samples of a pass: one or two seconds on two CPU cores. It must not depend
 #: on the speed, so that the same seed gives the same image.

@@ -3,7 +3,7 @@
 The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
 heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
 same order, so a render of one pass returns the same image. It differs where ``path`` loses light:
-on masks with nothing behind them, and between surfaces that are very close (``ray_starts.py``). In
+on masks with nothing behind them, and between surfaces that are very close (``scene_query.py``). In
 scenes with participating media, it is ``volpath`` (``media.py``). A technique replaces one decision
 (``path_decisions.py``). Dr.Jit inlines Python while it traces, so a replaced decision costs only
 its own work, and a default one costs nothing.
@@ -17,8 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..startup.garbage import garbage_left_alone
-from .connection import Connection, Connector
-from .emission import can_be_hit, emission
+from .connection import Connection, Connector, can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes

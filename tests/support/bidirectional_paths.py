@@ -8,10 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.estimators.light_paths.bidirectional_program import BidirectionalProgram
+from mitsuba_ext.estimators.light_paths.bidirectional_programs import (
+    BidirectionalProgram,
+    LightSums,
+)
 from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
-from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, weight
 from mitsuba_ext.estimators.light_paths.scattering import (
     cosine_of_delta,
@@ -19,7 +21,7 @@ from mitsuba_ext.estimators.light_paths.scattering import (
     reverse_density,
 )
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
-from mitsuba_ext.transport.emission import emission
+from mitsuba_ext.transport.connection import emission
 from mitsuba_ext.transport.path_decisions import (
     EmitterSampling,
     SceneQuery,

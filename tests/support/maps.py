@@ -11,8 +11,7 @@ import numpy as np
 
 from mitsuba_ext.scene.lights.choice import Choice
 from mitsuba_ext.scene.lights.light_cells import LightCells
-from mitsuba_ext.scene.regions.surface_rows import SurfaceRows, voxel_edges
-from mitsuba_ext.scene.regions.surface_sides import region
+from mitsuba_ext.scene.regions.surface_voxels import SurfaceRows, region, voxel_edges
 from mitsuba_ext.techniques.learned_lights.learner import LightMapLearner
 from mitsuba_ext.techniques.learned_lights.light_map import LightMap
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers

@@ -11,9 +11,8 @@ import mitsuba as mi
 
 from ...rendering.camera import film_extent
 from ...rendering.pace import StageSamples, TimeLimit
-from ...rendering.pass_timer import PassTimer
 from ...rendering.request import Request
-from ...rendering.statistics import RenderStatistics
+from ...rendering.statistics import PassTimer, RenderStatistics
 from ...rendering.turns import let_others, tell
 from .chains import Chains, MutationCounts
 from .looped import LoopedChains

@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ...rendering.camera import Lanes, camera_rays, draw_numbers, film_extent
-from ...transport.colour import to_rgb
 from ...transport.decisions import CameraSamples
 from ...transport.estimator import CameraRays, Estimator, Sample
 from ...transport.frozen import frozen
 from ...transport.numbers import Numbers, copied, go_to, reached
+from ...util.spectra import to_rgb
 
 
 @dataclass

@@ -11,10 +11,10 @@ import numpy as np
 from ...rendering import camera
 from ...rendering.render import Job
 from ...rendering.request import Request
-from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays, Sample
 from ...transport.lens_view import LensView
 from ...util.arrays import from_numpy
+from ...util.spectra import to_rgb
 from .denoised import denoised
 from .filters import FILTERS, Capture
 from .images import Size

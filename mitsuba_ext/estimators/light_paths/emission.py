@@ -11,11 +11,24 @@ import numpy as np
 from ...scene.bounds import scene_bounds
 from ...scene.bsdfs import bsdf_table, has_clear_curves
 from ...transport.numbers import Numbers
-from ...transport.ray_starts import ray_starts
-from . import light_pieces as pieces
-from .emitter_table import EmitterRow, EmitterTable
+from ...transport.scene_query import ray_starts
+from .emitter_table import (
+    AS_BEAM,
+    CYLINDER,
+    DISK,
+    INFINITE,
+    POINT,
+    PROJECTOR,
+    SPHERE,
+    SPOT,
+    TO_BOTH_SIDES,
+    TRIANGLE,
+    EmitterRow,
+    EmitterTable,
+    LightPieces,
+    Piece,
+)
 from .light_directions import NOT_RECIPROCAL
-from .light_pieces import LightPieces, Piece
 from .stored_interaction import needs_whole_interaction
 
 #: The fraction of the rays of a mesh light with interpolated normals that leave to the back of a
@@ -108,12 +121,12 @@ class LightEmission:
                          mi.EmitterFlags.Infinite)
         )  # fmt: skip
         kind = self._pieces.kind
-        is_surface = kind <= pieces.CYLINDER
+        is_surface = kind <= CYLINDER
         self._has_surfaces = bool(is_surface.any())
         beams = np.flatnonzero(is_surface & self._delta_direction)
         self._beams = [(int(index), emitters[index]) for index in beams]
         self._has_beams = bool(self._beams)
-        self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
+        self.has_smooth_meshes = bool((self._pieces.way == TO_BOTH_SIDES).any())
         self._has_opposite_normals = self._pieces.has_opposite_normals
         self._kinds = set(kind.tolist())
         if self._has_beams and mi.is_spectral:
@@ -153,7 +166,7 @@ class LightEmission:
         index = piece.emitter
         emitter = dr.gather(mi.EmitterPtr, self._emitters, index, active)
         row = self._table.row(index, active)
-        is_surface = active & (piece.kind <= pieces.CYLINDER)
+        is_surface = active & (piece.kind <= CYLINDER)
         ray = dr.zeros(mi.Ray3f, dr.width(index))
         ray.time, ray.wavelengths = time, wavelengths
         start = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
@@ -164,7 +177,7 @@ class LightEmission:
             start, d, weight, pdf_direction, cosine = self._leave_surface(
                 piece, emitter, ray, u, v, is_surface
             )
-        if self._kinds - set(range(pieces.POINT)):
+        if self._kinds - set(range(POINT)):
             p, other_d, other_weight, other_pdf = self._leave_nothing(
                 piece, emitter, start, u, v, active & ~is_surface
             )
@@ -195,7 +208,7 @@ class LightEmission:
         is_back = mi.Bool(False)
         local = mi.warp.square_to_cosine_hemisphere(v)
         if self.has_smooth_meshes:
-            is_smooth = piece.parameter == float(pieces.TO_BOTH_SIDES)
+            is_smooth = piece.parameter == float(TO_BOTH_SIDES)
             is_back = is_smooth & (v.x < _TO_BACK)
             x = dr.select(is_back, v.x / _TO_BACK, (v.x - _TO_BACK) / (1 - _TO_BACK))
             turned = mi.warp.square_to_cosine_hemisphere(
@@ -203,7 +216,7 @@ class LightEmission:
             )
             local = dr.select(is_back, mi.Vector3f(turned.x, turned.y, -turned.z), turned)
         if self._has_beams:
-            is_beam = piece.parameter == float(pieces.AS_BEAM)
+            is_beam = piece.parameter == float(AS_BEAM)
             local = dr.select(is_beam, mi.Vector3f(0, 0, 1), local)
         d, cosine = mi.Frame3f(self.front(si)).to_world(local), dr.abs(local.z)
         pdf = self._cosine_density(local.z, piece.parameter)
@@ -234,17 +247,17 @@ class LightEmission:
             x, y, z = (dr.select(chosen, a, b) for a, b in zip(values, (x, y, z)))
             prim_uv = dr.select(chosen, mi.Point2f(values[0], values[1]), prim_uv)
 
-        if pieces.TRIANGLE in self._kinds:
+        if TRIANGLE in self._kinds:
             t = mi.warp.square_to_uniform_triangle(u)
-            take(pieces.TRIANGLE, t.x, t.y, mi.Float(0))
-        if pieces.DISK in self._kinds:
+            take(TRIANGLE, t.x, t.y, mi.Float(0))
+        if DISK in self._kinds:
             t = mi.warp.square_to_uniform_disk_concentric(u)
-            take(pieces.DISK, t.x, t.y, mi.Float(0))
-        if pieces.SPHERE in self._kinds:
-            take(pieces.SPHERE, *mi.warp.square_to_uniform_sphere(u))
-        if pieces.CYLINDER in self._kinds:
+            take(DISK, t.x, t.y, mi.Float(0))
+        if SPHERE in self._kinds:
+            take(SPHERE, *mi.warp.square_to_uniform_sphere(u))
+        if CYLINDER in self._kinds:
             sin, cos = dr.sincos(dr.two_pi * u.x)
-            take(pieces.CYLINDER, cos, sin, u.y)
+            take(CYLINDER, cos, sin, u.y)
         return mi.Point3f(piece.point(x, y, z)), prim_uv
 
     def _found(self, piece, emitter, ray, p, prim_uv, active) -> mi.SurfaceInteraction3f:
@@ -263,18 +276,18 @@ class LightEmission:
         density of the direction, and this density."""
         ref = mi.Interaction3f(start)
         p, d, pdf = mi.Point3f(piece.vector(0)), mi.Vector3f(0, 0, 1), mi.Float(1)
-        is_infinite = piece.kind == pieces.INFINITE
-        if pieces.POINT in self._kinds:
-            is_point = piece.kind == pieces.POINT
+        is_infinite = piece.kind == INFINITE
+        if POINT in self._kinds:
+            is_point = piece.kind == POINT
             d = dr.select(is_point, mi.warp.square_to_uniform_sphere(v), d)
             pdf = dr.select(is_point, dr.inv_four_pi, pdf)
-        if pieces.SPOT in self._kinds:
-            is_spot = piece.kind == pieces.SPOT
+        if SPOT in self._kinds:
+            is_spot = piece.kind == SPOT
             local = mi.warp.square_to_uniform_cone(v, dr.select(is_spot, piece.parameter, 0))
             d = dr.select(is_spot, piece.direction(*local), d)
             pdf = dr.select(is_spot, _cone_density(piece.parameter), pdf)
-        if pieces.PROJECTOR in self._kinds:
-            is_projector = piece.kind == pieces.PROJECTOR
+        if PROJECTOR in self._kinds:
+            is_projector = piece.kind == PROJECTOR
             through = piece.direction(2 * v.x - 1, 2 * v.y - 1, mi.Float(1))
             # The axis has length 1, so that the cosine with it is 1 / distance
             distance = dr.norm(dr.select(is_projector, through, mi.Vector3f(0, 0, 1)))
@@ -285,7 +298,7 @@ class LightEmission:
         ref.p = dr.select(is_infinite, self._centre, p + self._radius * d)
         ds, weight = emitter.sample_direction(ref, v, active)
         weight = dr.select(is_infinite, weight, weight * (dr.square(ds.dist) / pdf))
-        if pieces.INFINITE in self._kinds:
+        if INFINITE in self._kinds:
             d = dr.select(is_infinite, -ds.d, d)
             pdf = dr.select(is_infinite, ds.pdf, pdf)
             disk = mi.warp.square_to_uniform_disk_concentric(u)
@@ -326,19 +339,19 @@ class LightEmission:
         pdf = mi.Float(1)
         if self._has_surfaces:
             leaves = self._cosine_density if knows_normal else self._weighing_density
-            pdf = dr.select(row.kind <= pieces.CYLINDER, leaves(dr.dot(n, d), row.way), pdf)
-        if pieces.POINT in self._kinds:
-            pdf = dr.select(row.kind == pieces.POINT, dr.inv_four_pi, pdf)
-        if pieces.SPOT in self._kinds:
+            pdf = dr.select(row.kind <= CYLINDER, leaves(dr.dot(n, d), row.way), pdf)
+        if POINT in self._kinds:
+            pdf = dr.select(row.kind == POINT, dr.inv_four_pi, pdf)
+        if SPOT in self._kinds:
             inside = dr.dot(d, row.axis) >= row.parameter
             spot = dr.select(inside, _cone_density(row.parameter), 0)
-            pdf = dr.select(row.kind == pieces.SPOT, spot, pdf)
-        if pieces.PROJECTOR in self._kinds:
+            pdf = dr.select(row.kind == SPOT, spot, pdf)
+        if PROJECTOR in self._kinds:
             cosine = dr.dot(d, row.axis)
             image = dr.select(cosine > 0, dr.rcp(row.parameter * cosine**3), 0)
-            pdf = dr.select(row.kind == pieces.PROJECTOR, image, pdf)
-        if pieces.INFINITE in self._kinds:
-            is_infinite = row.kind == pieces.INFINITE
+            pdf = dr.select(row.kind == PROJECTOR, image, pdf)
+        if INFINITE in self._kinds:
+            is_infinite = row.kind == INFINITE
             ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
             ds.d, ds.emitter = -d, emitter
             sky = emitter.pdf_direction(ref, ds, active & is_infinite & ~row.is_beam)
@@ -366,16 +379,16 @@ class LightEmission:
         """The density of a direction of emission that has this cosine with the normal."""
         front = dr.maximum(cosine, 0) * dr.inv_pi
         both = dr.select(cosine < 0, -_TO_BACK, 1 - _TO_BACK) * cosine * dr.inv_pi
-        return dr.select(way == float(pieces.TO_BOTH_SIDES), both, front)
+        return dr.select(way == float(TO_BOTH_SIDES), both, front)
 
     def _weighing_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
         """Like :meth:`_cosine_density`, for MIS weights: see :meth:`densities`."""
-        is_smooth = self.has_smooth_meshes & (way == float(pieces.TO_BOTH_SIDES))
+        is_smooth = self.has_smooth_meshes & (way == float(TO_BOTH_SIDES))
         return self._cosine_density(dr.select(is_smooth, dr.abs(cosine), cosine), way)
 
     def _flags(self, kind: mi.UInt32, row: EmitterRow) -> tuple[mi.Bool, mi.Bool, mi.Bool]:
-        is_point = (kind >= pieces.POINT) & (kind <= pieces.PROJECTOR)
-        return is_point, row.is_beam, kind == pieces.INFINITE
+        is_point = (kind >= POINT) & (kind <= PROJECTOR)
+        return is_point, row.is_beam, kind == INFINITE
 
 
 def _cone_density(cos_cutoff: mi.Float) -> mi.Float:

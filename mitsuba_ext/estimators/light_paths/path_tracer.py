@@ -18,14 +18,13 @@ from ...transport.path_decisions import SubpathSelection
 from ...transport.path_program import PathProgram
 from ...transport.walk import Walk
 from ...transport.without_lengths import WithoutLengths
-from .bidirectional_program import BidirectionalProgram
+from .bidirectional_programs import BidirectionalProgram, LightSums
 from .choice.candidates import Available
 from .choice.technique_observer import TechniqueObserver
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
 from .light_numbers import LightPathRays
-from .light_sums import LightSums
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths

@@ -17,9 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...util.spectra import brightness, comparison_wavelengths
 from ..lightweight_shapes import surface
-from ..regions.voxel_sides import SIDES, sides, voxel_number
-from .spectra import brightness, comparison_wavelengths
+from ..regions.surface_voxels import SIDES, sides, voxel_number
 
 #: The maximum number of cells of one emitter.
 _MAX_CELLS = 64

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...util.spectra import brightness, comparison_wavelengths
 from .environment_directions import EnvironmentDirections
-from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
 
 #: The numbers of columns and rows of nodes at which emitters without a map are evaluated. Features

@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...util.arrays import from_numpy
+from ...util.spectra import brightness
 from ..bounds import scene_bounds
 from ..movers import is_moving_light
 from .division import emitter_shapes
-from .spectra import brightness
 
 #: The number of samples of each emitter.
 _SAMPLES = 256

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...util.arrays import from_numpy
-from .spectra import brightness, comparison_wavelengths
+from ...util.spectra import brightness, comparison_wavelengths
 
 #: Angles at which the edge of the disk is searched for, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ...util.spectra import brightness, comparison_wavelengths
 from .environment_bins import EnvironmentBins
-from .spectra import brightness, comparison_wavelengths
 
 #: The number of directions along each of the two axes of a bin.
 _SIDE = 8

@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...util.arrays import from_numpy
-from ..regions.surface_rows import SurfaceRows
+from ...util.spectra import brightness, comparison_wavelengths
+from ..regions.surface_voxels import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
 from .light_cells import LightCells
 from .power import emitter_powers
 from .shutter_times import ShutterTimes
-from .spectra import brightness, comparison_wavelengths
 
 #: The minimum weight of a cell, relative to the mean of its row (as in pbrt).
 _FLOOR = 1e-3

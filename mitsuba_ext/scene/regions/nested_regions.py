@@ -8,8 +8,7 @@ import numpy as np
 
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
-from .surface_sides import region
-from .voxel_sides import SIDES, VoxelSides, voxel_coordinates
+from .surface_voxels import SIDES, VoxelSides, region, voxel_coordinates
 
 #: The number of voxels along each axis at each level; they divide the previous level's voxels.
 _GRIDS = (4, 8, 16, 32)

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..bounds import scene_bounds
-from .voxel_sides import voxel_at, voxel_coordinates, voxel_number
+from .surface_voxels import voxel_at, voxel_coordinates, voxel_number
 
 #: The index of an empty voxel.
 EMPTY = 0xFFFFFFFF

@@ -9,7 +9,7 @@ from ...planning.learner import Learner, Pilot
 from ...transport.path_decisions import Roulette
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
-from .adjoint_roulette import AdjointRoulette
+from .decisions import AdjointRoulette
 from .learner import GuideLearner
 
 

@@ -18,8 +18,7 @@ from ...planning.verdicts import GUIDES_GROW, is_trial, least
 from ...transport.observer import Observer
 from ...transport.path_decisions import Roulette
 from ...util.stored_arrays import StoredArrays
-from .adjoint_roulette import AdjointRoulette
-from .decision import GuidedDirections, Regions
+from .decisions import AdjointRoulette, GuidedDirections, Regions
 from .path_records import BYTES_PER_RECORD, PathRecords
 from .roulette_trial import BYTES_PER_PATH, RouletteTrial
 from .sample_trees import SampleTrees

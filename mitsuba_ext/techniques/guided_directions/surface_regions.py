@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...scene.regions.nested_regions import NestedRegions
-from ...scene.regions.surface_sides import lit_normal
+from ...scene.regions.surface_voxels import lit_normal
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .path_records import PathRecords

@@ -17,8 +17,13 @@ from ...planning.verdicts import FINER_MAP_SHARE, FIRST_MAP_SHARE, REFINING, is_
 from ...scene.lights.environment_bins import EnvironmentBins
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.weights import uniform_weights
-from ...scene.regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
-from ...scene.regions.surface_sides import region
+from ...scene.regions.surface_voxels import (
+    BYTES_PER_VOXEL,
+    RowCounts,
+    SurfaceRows,
+    region,
+    voxel_edges,
+)
 from ...transport.light_table import LightTable
 from ...transport.observer import Observer
 from ...transport.rejection_law import RejectionLaw

@@ -11,11 +11,11 @@ import mitsuba as mi
 
 from ...scene.lights.choice import Choice
 from ...scene.lights.light_cells import LightCells
-from ...scene.lights.spectra import brightness
 from ...scene.lights.weights import unoccluded_weights
-from ...scene.regions.surface_rows import SurfaceRows
+from ...scene.regions.surface_voxels import SurfaceRows
 from ...transport.observer import Observer
 from ...transport.vertex import Vertex
+from ...util.spectra import brightness
 
 #: Fixed point of the squared ratios. They are clipped, so that a single one cannot dominate.
 _UNIT, _LIMIT = 2.0**20, 16.0

@@ -8,7 +8,7 @@ import numpy as np
 from ...scene.fingerprint import digest
 from ...scene.lights.division import emitter_shapes
 from ...scene.lights.light_cells import LightCells
-from ...scene.regions.surface_rows import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
+from ...scene.regions.surface_voxels import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .light_map import BYTES_PER_ENTRY, MOST_SQUARED, LightMap

@@ -12,11 +12,11 @@ import numpy as np
 from ...scene.bounds import scene_bounds, shape_bounds
 from ...scene.lights.division import emitter_shapes
 from ...scene.lights.light_cells import LightCells
-from ...scene.lights.spectra import comparison_wavelengths
 from ...scene.lights.weights import power_weights
 from ...scene.movers import is_moving_light
 from ...transport.path_decisions import EmitterSampling
 from ...util.arrays import from_numpy
+from ...util.spectra import comparison_wavelengths
 
 #: Added to the largest cosine under which a vertex sees a light. Glossy reflection does not
 #: decrease with the cosine, and only a light this far below the tangent plane gets the estimate 0.

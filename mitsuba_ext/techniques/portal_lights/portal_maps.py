@@ -13,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from ...scene.lights.environment_directions import EnvironmentDirections
-from ...scene.lights.spectra import brightness, comparison_wavelengths
 from ...scene.lights.sun import SunDisk
 from ...scene.portals import Portal
 from ...util.arrays import from_numpy
 from ...util.discrete_sampling import ONE_MINUS_EPSILON
+from ...util.spectra import brightness, comparison_wavelengths
 
 #: The fewest and the most texels of a map along each axis, which spans half a turn.
 _LEAST, _MOST = 256, 2048

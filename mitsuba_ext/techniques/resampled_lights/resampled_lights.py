@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ...scene.lights.environment_directions import EnvironmentDirections
-from ...scene.lights.spectra import brightness
 from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from ...transport.heroes import Heroes
 from ...transport.path_decisions import EmitterSampling, LightNumbers
+from ...util.spectra import brightness
 
 #: A lattice that is even for every number of points (the reciprocals of the plastic number), and
 #: the golden ratio for a third number.

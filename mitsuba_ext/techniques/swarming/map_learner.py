@@ -14,9 +14,9 @@ from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import brightness
 from ...planning.prediction import Effect, Prediction
 from ...rendering.film_tiles import FilmTiles
-from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ...util.arrays import from_numpy
+from ...util.spectra import to_rgb
 from ...util.stored_arrays import StoredArrays
 from .cells import CellDensities, Cells
 from .estimate import Form, Grid, Shares, estimate

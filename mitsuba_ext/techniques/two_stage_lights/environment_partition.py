@@ -17,10 +17,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...scene.lights.spectra import brightness
 from ...scene.lights.texel_sums import Corners, Rectangle, TexelSums, part_of
 from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from ...util.discrete_sampling import ONE_MINUS_EPSILON
+from ...util.spectra import brightness
 from .environment_visibility import Tile, WorldVisibility
 from .partition_parts import Branch, Node, Partition, Peak
 

@@ -13,7 +13,7 @@ import numpy as np
 from ...scene.motion.rigid_motion import Pose, PoseTable
 from ...util.arrays import from_numpy
 from ..path_decisions import SceneQuery
-from ..ray_starts import RayStarts
+from ..scene_query import RayStarts
 from .box import Box
 
 #: The owner of shapes that do not move.

@@ -6,8 +6,7 @@ import mitsuba as mi
 
 from ...scene.lightweight_shapes import lightweight_shapes
 from ...scene.movers import movers
-from ..ray_starts import ray_starts
-from ..scene_query import SceneQuery
+from ..scene_query import SceneQuery, ray_starts
 from .lightweight_scene import LightweightQuery
 from .moving_scene import MovingSceneQuery
 

@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering.pass_timer import kernel_cache_misses
 from mitsuba_ext.rendering.pixel_moments import PixelMoments
 from mitsuba_ext.rendering.sample_allocation import SampleAllocation
+from mitsuba_ext.rendering.statistics import kernel_cache_misses
 from tests.support.batched import film_channels
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor, stage
 from tests.support.statistical import assert_images_are_sound, assert_same_mean, batches

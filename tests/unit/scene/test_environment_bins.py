@@ -12,10 +12,10 @@ from scipy import stats
 
 from mitsuba_ext.scene.lights.environment_bins import BINS, EnvironmentBins
 from mitsuba_ext.scene.lights.light_cells import LightCells
-from mitsuba_ext.scene.lights.spectra import brightness, comparison_wavelengths
 from mitsuba_ext.scene.lights.sun import SunDisk
 from mitsuba_ext.scene.lights.tabulated_bins import TabulatedBins
 from mitsuba_ext.util.discrete_sampling import alias_tables
+from mitsuba_ext.util.spectra import brightness, comparison_wavelengths
 from tests.support.environments import ENVIRONMENTS, SPOTS, random_point
 
 LANES = 1 << 18

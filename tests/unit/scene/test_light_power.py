@@ -9,10 +9,10 @@ import pytest
 
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.power import emitter_powers
-from mitsuba_ext.scene.lights.spectra import brightness
 from mitsuba_ext.scene.lights.weights import power_weights
 from mitsuba_ext.techniques.linear_lights.linear_lights import LinearChoice
 from mitsuba_ext.transport.light_table import LightTable, OneRow
+from mitsuba_ext.util.spectra import brightness
 from tests.support.maps import connect, floor, lamp, surface
 
 pytestmark = pytest.mark.usefixtures("variant")

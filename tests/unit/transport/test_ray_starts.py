@@ -10,7 +10,7 @@ import pytest
 
 from mitsuba_ext.scene.bounds import scene_bounds
 from mitsuba_ext.transport.queries.scene import scene_query
-from mitsuba_ext.transport.ray_starts import RayStarts, ray_starts
+from mitsuba_ext.transport.scene_query import RayStarts, ray_starts
 from tests.support.stage import area, diffuse, film, lookat, sensor, stage
 from tests.support.statistical import batches, some
 

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ....transport.bsdfs import eval_bsdf, sample_bsdf
-from ....transport.colour import to_rgb
 from ....transport.hidden_emitters import behind_emitters
 from ....transport.numbers import Numbers
+from ....util.spectra import to_rgb
 from ...light_paths.scattering import geometric_cosine, reverse_density
 from .light_subpaths import HIGH, LOW
 from .lights import light_start_densities

@@ -12,7 +12,7 @@ from ....planning.pixel_estimates import brightness
 from ....planning.technique import Setting, Technique
 from ....rendering.camera import film_extent
 from ....scene.movers import movers
-from ....scene.regions.surface_sides import lit_normal
+from ....scene.regions.surface_voxels import lit_normal
 from ....transport.queries.scene import scene_query
 from ..both_ends import from_both_ends
 from ..emission import LightEmission

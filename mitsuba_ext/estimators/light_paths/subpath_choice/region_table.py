@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ....scene.regions.nested_regions import NestedRegions
-from ....scene.regions.surface_sides import lit_normal
+from ....scene.regions.surface_voxels import lit_normal
 from ....transport.light_table import alias_rows
 from ....transport.path_decisions import SubpathSelection
 from ....util.arrays import from_numpy

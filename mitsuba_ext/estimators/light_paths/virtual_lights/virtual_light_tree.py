@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ....scene.regions.surface_sides import lit_normal
+from ....scene.regions.surface_voxels import lit_normal
 from ....util.arrays import from_numpy
 from ..vertex_choice import Chosen
 from .virtual_light_choice import emitted_flux

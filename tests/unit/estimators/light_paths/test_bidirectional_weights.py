@@ -16,7 +16,7 @@ from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import Regio
 from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
-from mitsuba_ext.scene.regions.surface_rows import SurfaceRows
+from mitsuba_ext.scene.regions.surface_voxels import SurfaceRows
 from mitsuba_ext.transport.light_table import LightTable, sampling_weights
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
 from tests.support.bidirectional_paths import (

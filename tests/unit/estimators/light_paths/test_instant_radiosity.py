@@ -25,7 +25,7 @@ from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_choice impo
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_light_tree import ClusteredChoice
 from mitsuba_ext.estimators.light_paths.virtual_lights.virtual_lights import Sets, VirtualLights
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
-from mitsuba_ext.scene.regions.surface_sides import lit_normal
+from mitsuba_ext.scene.regions.surface_voxels import lit_normal
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 from tests.support.emitters_and_materials import (

@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.estimators.light_paths.bidirectional_programs import LightSums
 from mitsuba_ext.estimators.light_paths.light_program import LightProgram
-from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
 from mitsuba_ext.estimators.light_paths.photons.photon_history import (
     HiddenLight,

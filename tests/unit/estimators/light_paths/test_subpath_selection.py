@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mitsuba_ext.estimators.light_paths.bidirectional_programs import LightSums
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
-from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.light_vertices import PackedVertices, VertexCache
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
@@ -20,7 +20,7 @@ from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import Regio
 from mitsuba_ext.estimators.light_paths.vertex_choice import RegionChoice
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.scene.regions.nested_regions import NestedRegions
-from mitsuba_ext.scene.regions.surface_sides import lit_normal
+from mitsuba_ext.scene.regions.surface_voxels import lit_normal
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 from tests.support.bdpt import assert_image_of_path, bdpt

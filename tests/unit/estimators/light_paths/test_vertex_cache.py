@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.estimators.light_paths.bidirectional_programs import LightSums
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
-from mitsuba_ext.estimators.light_paths.light_sums import LightSums
 from mitsuba_ext.estimators.light_paths.light_vertices import (
     LightVertices,
     PackedVertices,

@@ -12,7 +12,7 @@ import pytest
 from mitsuba_ext.planning.learner import Pilot
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
 from mitsuba_ext.planning.technique import Setting
-from mitsuba_ext.techniques.guided_directions.decision import GuidedDirections
+from mitsuba_ext.techniques.guided_directions.decisions import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner, most_efficient
 from mitsuba_ext.techniques.guided_directions.path_records import BYTES_PER_RECORD, PathRecords
 from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
-from mitsuba_ext.techniques.guided_directions.adjoint_roulette import AdjointRoulette
+from mitsuba_ext.techniques.guided_directions.decisions import AdjointRoulette
 from mitsuba_ext.techniques.guided_directions.roulette_trial import Outcome, RouletteTrial
 from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
 from mitsuba_ext.transport.path_decisions import Roulette

@@ -10,16 +10,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning.scout import Scout
 from mitsuba_ext.scene.lights.choice import Choice
 from mitsuba_ext.scene.lights.light_cells import LightCells
 from mitsuba_ext.scene.lights.shutter_times import ShutterTimes
-from mitsuba_ext.scene.regions.surface_rows import RowCounts, SurfaceRows
-from mitsuba_ext.scene.regions.surface_sides import region
+from mitsuba_ext.scene.regions.surface_voxels import RowCounts, SurfaceRows, region
 from mitsuba_ext.techniques.learned_lights.light_map import LightMap
 from mitsuba_ext.techniques.learned_lights.shadow_roulette import LightMapRoulette
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.light_table import LightTable
+from mitsuba_ext.transport.observer import Scout
 from mitsuba_ext.transport.rejection_law import RejectionLaw
 from tests.support.maps import (
     connect,

@@ -11,11 +11,11 @@ import pytest
 from scipy import stats
 
 from mitsuba_ext.scene.lights.environment_texels import EnvironmentTexels
-from mitsuba_ext.scene.lights.spectra import brightness
 from mitsuba_ext.scene.lights.texel_sums import Corners, TexelSums
 from mitsuba_ext.techniques.two_stage_lights.environment_partition import Partitioner
 from mitsuba_ext.techniques.two_stage_lights.two_stage import TwoStage
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
+from mitsuba_ext.util.spectra import brightness
 from tests.support.environments import (
     BSDFS,
     LANES,

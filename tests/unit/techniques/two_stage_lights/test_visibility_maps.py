@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.rendering.pass_timer import kernel_cache_misses
+from mitsuba_ext.rendering.statistics import kernel_cache_misses
 from mitsuba_ext.techniques.two_stage_lights.environment_visibility import (
     PrimaryVisibility,
     Tile,

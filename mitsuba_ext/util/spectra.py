@@ -1,11 +1,11 @@
-"""Reduces spectra to single numbers, with which lights are compared."""
+"""Reduces spectra to colours, and to single numbers by which lights are compared."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from ...util.arrays import channel_mean
+from .arrays import channel_mean
 
 
 def brightness(value: mi.Spectrum) -> mi.Float:
@@ -21,3 +21,10 @@ def comparison_wavelengths(width: int) -> mi.Spectrum:
     if mi.is_spectral:
         wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
     return wavelengths
+
+
+def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
+    """Radiance as the colour that films store."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(L, wavelengths)
+    return mi.Color3f(L.x) if mi.is_monochromatic else L
