@@ -11,7 +11,6 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.bases.slots import auto_techniques
-from mitsuba_ext.bases.staged_integrator import NO_LIMIT
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
 from mitsuba_ext.estimators.light_paths.choice.light_paths import (
     AutoLightPaths,
@@ -160,9 +159,9 @@ class Auto(LightPathIntegrator):
         return 1
 
     @property
-    def most_lanes(self) -> int:
+    def bytes_per_sample(self) -> float:
         # Stages with light paths have limits of their own
-        return NO_LIMIT
+        return 0
 
     def plan_learning(self, request, spp, kernels=math.inf):
         scene, film = request.scene, request.sensor.film()

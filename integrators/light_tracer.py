@@ -9,8 +9,8 @@ from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_s
 from mitsuba_ext.estimators.light_paths.light_program import StoredHistory
 from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
-from mitsuba_ext.estimators.light_paths.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
+from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_light_path
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
@@ -18,9 +18,6 @@ from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import sensor_at_rest
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
-
-#: Bytes for the vertices of a pass; and bytes, about, that a path takes besides.
-_PASS_BYTES, _PATH_BYTES = 1 << 29, 256
 
 
 @registry.plugin
@@ -119,9 +116,8 @@ class LightTracerIntegrator(WalkIntegrator):
         return 2
 
     @property
-    def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), StoredHistory(), True)
-        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+    def bytes_per_sample(self) -> float:
+        return bytes_of_light_path(StoredHistory(), kept=False)
 
     @property
     def needs_equal_samples(self) -> str:

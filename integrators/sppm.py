@@ -12,7 +12,7 @@ from mitsuba_ext.estimators.light_paths.merging.merging_parameters import (
     MergingParameters,
     shared_numbers,
 )
-from mitsuba_ext.estimators.light_paths.photons.photon_mapper import most_lanes
+from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_photons
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry
@@ -129,8 +129,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
         return max(3, math.ceil(self.light_paths))
 
     @property
-    def most_lanes(self) -> int:
-        return most_lanes(self.light_paths)
+    def bytes_per_sample(self) -> float:
+        return bytes_of_photons(self.light_paths)
 
     def schedule(self, request, samples, learning) -> OneStage:
         scene = request.scene

@@ -14,19 +14,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..estimators.light_paths.bidirectional_programs import LightSums, StoredSums
+from ..estimators.light_paths.bidirectional_programs import LightSums
 from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_side import LightSide
-from ..estimators.light_paths.light_vertices import Layout, bytes_per_vertex
-from ..estimators.light_paths.light_walk import STRIDE, LightWalk
+from ..estimators.light_paths.light_walk import LightWalk
 from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers
 from ..estimators.light_paths.merging.merging_radius import MergingRadius
 from ..estimators.light_paths.partial_sums import PartialSums
+from ..estimators.light_paths.path_memory import bytes_of_both_paths
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..images import image_files
 from ..rendering.camera import film_extent
+from ..rendering.device import device_of
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule
 from ..rendering.statistics import RenderStatistics
@@ -41,10 +42,6 @@ from .walk_integrator import WalkIntegrator
 
 #: The decisions that a scene can replace, of camera paths and of light paths.
 _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
-
-#: Bytes for what a pass stores; and bytes, about, that a light path takes besides the vertices that
-#: are stored at a time, and that a camera path takes.
-_PASS_BYTES, _LIGHT_BYTES, _CAMERA_BYTES = 1 << 29, 512, 128
 
 
 @variant_bound
@@ -77,8 +74,8 @@ class LightPathIntegrator(WalkIntegrator):
         return max(3, super().sample_cost)
 
     @property
-    def most_lanes(self) -> int:
-        return _most_lanes(getattr(self.slots.get("light_paths"), "count", 1.0))
+    def bytes_per_sample(self) -> float:
+        return bytes_of_both_paths(getattr(self.slots.get("light_paths"), "count", 1.0))
 
     def connects_to(self, scene: mi.Scene, sensor: mi.Sensor) -> bool:
         """Whether all lights of the scene can emit light paths, and the sensor receives them."""
@@ -95,7 +92,9 @@ class LightPathIntegrator(WalkIntegrator):
         side = LightSide.of(self.name, scene, request.sensor, self.light_image)
         check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
         if self.technique_images:
-            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
+            self.techniques = TechniqueImages(
+                film, *film_extent(film), self.max_depth, device_of(mi.Float).pass_bytes
+            )
         radius = Once(functools.partial(self.merging_radius, request, side))
         return LightPathEstimators(self, side, radius, self.techniques)
 
@@ -198,7 +197,7 @@ class LightPathEstimators:
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
             merges_all=integrator.merges_all, light_paths=techniques.light_paths,
-            most_lanes=_most_lanes(techniques.light_paths),
+            most_lanes=device_of(mi.Float).lanes(bytes_of_both_paths(techniques.light_paths)),
         )  # fmt: skip
 
 
@@ -252,10 +251,3 @@ class Once:
         if self._function is not None:
             self._result, self._function = self._function(*arguments), None
         return self._result
-
-
-def _most_lanes(light_paths: float) -> int:
-    """The most camera paths in a pass, with this number of light paths for each."""
-    layout = Layout(len(mi.Spectrum()), StoredSums(5), True)
-    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _LIGHT_BYTES
-    return int(_PASS_BYTES / (light_paths * bytes_per_path + _CAMERA_BYTES))

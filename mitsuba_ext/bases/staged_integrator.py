@@ -109,9 +109,9 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return 1
 
     @property
-    def most_lanes(self) -> int:
-        """The most samples in a pass that memory allows."""
-        return NO_LIMIT
+    def bytes_per_sample(self) -> float:
+        """The approximate memory of a sample in a pass; 0 if it needs no more than a path."""
+        return 0
 
     def samples_per_set(self, spp: int) -> int:
         """How many of the ``spp`` samples of a pixel form a set, in a render with a timeout, which

@@ -85,8 +85,8 @@ class WrappingIntegrator(StagedIntegrator):
         return self.nested.sample_cost if self._is_staged else 1
 
     @property
-    def most_lanes(self) -> int:
-        return self.nested.most_lanes if self._is_staged else super().most_lanes
+    def bytes_per_sample(self) -> float:
+        return self.nested.bytes_per_sample if self._is_staged else 0
 
     @property
     def needs_equal_samples(self) -> str:

@@ -140,8 +140,8 @@ class Technique:
         doubles: Whether it can learn from one sample per pixel. Each pilot then has as many samples
             as all before it, and its samples weigh less, the less was known.
         tries: Whether what it learns in a first pilot makes the next ones better.
-        most_lanes: The most samples in a pass from which it learns, for the memory of what it
-            records; 0 for any number.
+        bytes_per_sample: Bytes that it records for each sample of a pass from which it learns; 0 if
+            the memory of its records has a limit.
         camera_paths_only: Whether it needs what only camera paths store at a vertex (from where it
             is seen, its depth, the density with which BSDF sampling finds a light).
         finds_all_light: Whether it is for camera paths that find all light alone: beside light
@@ -164,7 +164,7 @@ class Technique:
     pilot_paths = 0
     doubles = False
     tries = False
-    most_lanes = 0
+    bytes_per_sample = 0
     camera_paths_only = False
     finds_all_light = False
     sees_media = True

@@ -64,7 +64,7 @@ class AdaptiveJob(Job):
             self.moments, spp, first, integrator.threshold, self._set_size
         )
         self.limit.pilot_spp = first
-        most = min(self.plan.limit * self.plan.pixel_count, integrator.most_lanes)
+        most = min(self.plan.limit * self.plan.pixel_count, self.plan.most_lanes)
         self._most_sets = max(1, most // self._set_size)
 
     def _run_stage(

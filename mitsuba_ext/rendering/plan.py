@@ -6,23 +6,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 
 from ..util.parameters import MOST_SPP
 from .batches import NO_SAMPLES
 from .camera import film_extent
+from .device import Device
 from .request import Request
 from .staged import Staged
 from .stages import Learning
 
-#: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
-#: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
-_PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
-
-#: Least number of samples per pixel in a pass, also for large films: neighbouring lanes of the same
-#: pixel trace coherent rays. At 1920x1080, passes of one sample take 1.6 times as long. It does not
-#: apply to structured samplers, which keep a state for each sample of a pass.
+#: Least number of samples per pixel in a pass on a CPU, also for large films: neighbouring lanes of
+#: the same pixel trace coherent rays. At 1920x1080, passes of one sample take 1.6 times as long. It
+#: does not apply to structured samplers, which keep a state for each sample of a pass.
 _PASS_SPP = 16
 
 #: Least number of passes if an integrator that learns uses a structured sampler: pilots consist of
@@ -53,6 +49,9 @@ class RenderPlan:
         limit: Largest number of samples per pixel in a pass.
         set_size: Number of samples of a pixel that a timeout does not separate.
         parts: Number of parts of the film, which each pass renders one after the other.
+        most_lanes: Largest number of samples taken at a time for which memory suffices.
+        warp: The lanes that the device runs together: they have samples of one pixel where a pass
+            has that many.
     """
 
     spp: int
@@ -63,6 +62,8 @@ class RenderPlan:
     limit: int
     set_size: int
     parts: int = 1
+    most_lanes: int = _MAX_WAVEFRONT - 1
+    warp: int = 1
 
     def pass_length(self, samples: int, most_lanes: int = 0) -> int:
         """Samples per pixel of a pass, if ``samples`` samples are cut into passes of about equal
@@ -72,8 +73,10 @@ class RenderPlan:
         limit = self.limit
         if most_lanes:
             limit = max(1, min(limit, most_lanes // self.pixel_count))
+        limit = whole_warps(limit, self.warp)
         pass_count = -(-samples // limit)
-        return max(1, -(-samples // max(1, pass_count)))
+        length = max(1, -(-samples // max(1, pass_count)))
+        return min(limit, whole_warps(length + min(length, self.warp) - 1, self.warp))
 
     @property
     def pixels(self) -> list[range]:
@@ -93,8 +96,10 @@ class RenderPlan:
         return min(most, samples + -(before + samples) % self.set_size)
 
 
-def plan_render(integrator: Staged, request: Request, sampler: mi.Sampler) -> RenderPlan:
-    """The plan of a render. Sets the sampler's number of samples.
+def plan_render(
+    integrator: Staged, request: Request, sampler: mi.Sampler, device: Device
+) -> RenderPlan:
+    """The plan of a render by ``device``. Sets the sampler's number of samples.
 
     Raises:
         ValueError: ``spp`` is out of range, the film has more pixels than a wavefront can hold, or
@@ -114,14 +119,14 @@ def plan_render(integrator: Staged, request: Request, sampler: mi.Sampler) -> Re
     check_extent(film)
     pixel_count = math.prod(film_extent(film))
     structured = not is_independent(request.sensor)
-    cost = integrator.sample_cost
-    limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
-    if not structured:
+    cost, most_lanes = integrator.sample_cost, device.lanes(integrator.bytes_per_sample)
+    limit = device.pass_samples // (pixel_count * cost)
+    if not structured and not device.is_gpu:
         limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
     if structured and request.is_timed:
         limit //= _TIMEOUT_PASS_DIVISOR
-    limit = min(limit, integrator.samples_per_pass, integrator.most_lanes // pixel_count)
-    limit = max(1, limit)
+    limit = min(limit, integrator.samples_per_pass, most_lanes // pixel_count)
+    limit = whole_warps(max(1, limit), device.warp)
     if spp > limit * _MOST_PASSES:
         raise ValueError(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
@@ -141,8 +146,17 @@ def plan_render(integrator: Staged, request: Request, sampler: mi.Sampler) -> Re
         pilots = [limit * max(1, samples // limit) for samples in pilots]
     stages = (*pilots, spp - sum(pilots))
     # More than one part if even one sample of each pixel is too much at a time
-    parts = -(-pixel_count // integrator.most_lanes)
-    return RenderPlan(spp, stages, learning, pixel_count, structured, limit, set_size, parts)
+    parts = -(-pixel_count // most_lanes)
+    return RenderPlan(
+        spp, stages, learning, pixel_count, structured, limit, set_size, parts, most_lanes,
+        device.warp,
+    )  # fmt: skip
+
+
+def whole_warps(samples: int, warp: int) -> int:
+    """The number of samples per pixel, rounded down so that warps are not split between pixels: to
+    a multiple of ``warp``, or a power of two below it."""
+    return samples - samples % warp if samples >= warp else 1 << (samples.bit_length() - 1)
 
 
 def _divides(length: int, spp: int, set_size: int) -> bool:

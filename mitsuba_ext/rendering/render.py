@@ -21,13 +21,14 @@ from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import with_recordings
 from ..util.arrays import from_numpy
 from . import camera
+from .device import device_of, look_again
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt, interrupted
 from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
-from .plan import plan_render
+from .plan import plan_render, whole_warps
 from .request import Request
 from .staged import Staged
 from .stages import Schedule, Stage
@@ -95,7 +96,8 @@ class Job:
         self.integrator, self.request = integrator, request
         self.scene, self.sensor, self.film = request.scene, request.sensor, request.sensor.film()
         self.sampler = camera.own_sampler(self.sensor)
-        self.plan = plan_render(integrator, request, self.sampler)
+        look_again()
+        self.plan = plan_render(integrator, request, self.sampler, device_of(mi.Float))
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
         aovs = integrator.aov_names()
@@ -181,6 +183,7 @@ class Job:
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         if stage.images is not None and not self.plan.structured:
             length = min(length, -(-samples // FEWEST_PASSES))
+            length = whole_warps(length, self.plan.warp)
         while done < (wanted := self.plan.whole(before, known.samples, samples)):
             if self._stopped(interrupt):
                 return

@@ -30,8 +30,8 @@ class Staged(Protocol):
         """The approximate time of a sample, in units of the time of a path."""
 
     @property
-    def most_lanes(self) -> int:
-        """Largest number of samples that are taken at a time, limited by memory."""
+    def bytes_per_sample(self) -> float:
+        """The approximate memory of a sample in a pass; 0 if it needs no more than a path."""
 
     def samples_per_set(self, spp: int) -> int:
         """The number of samples of a pixel that a timeout must not separate."""

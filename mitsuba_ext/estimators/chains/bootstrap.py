@@ -9,15 +9,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...rendering.device import device_of
 from ...transport.numbers import BothEnds, Numbers
 from ...util.arrays import from_numpy
 from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator, stream
 from .small_steps import SmallSteps
 from .target import Found, ImageTarget
 
-#: The maximum number of samples evaluated at a time, without and with light paths, whose
-#: contributions are stored.
-_MAX_LANES = {False: 1 << 20, True: 1 << 18}
+#: Bytes of a sample, about, without and with light paths, whose contributions are stored.
+_BYTES = {False: 512, True: 2048}
 
 #: Streams of random numbers, different from the streams of the chains.
 _CAMERA, _LIGHT, _CHOICE = 0, 1, 2
@@ -55,7 +55,8 @@ class Bootstrap:
         self._cells = math.isqrt(count - 1) + 1
         self.count = self._cells**2
         # Parts of equal width, which share kernels
-        parts = -(-self.count // _MAX_LANES[target.has_light_paths])
+        most = device_of(mi.Float).lanes(_BYTES[target.has_light_paths])
+        parts = -(-self.count // most)
         width, values = -(-self.count // parts), []
         for part in range(parts):
             index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, part * width)

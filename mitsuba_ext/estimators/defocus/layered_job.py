@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...rendering import camera
+from ...rendering.device import device_of
 from ...rendering.render import Job
 from ...rendering.request import Request
 from ...transport.estimator import CameraRays, Sample
@@ -31,9 +32,6 @@ _MAX_MARGIN = 1 / 4
 
 #: The bit that marks the pixels in a list whose hidden surfaces are sampled.
 _HIDDEN_BIT = 0x80000000
-
-#: The maximum number of samples in a pass over a list of pixels.
-_MAX_LANES = 1 << 21
 
 
 class LayeredJob(Job):
@@ -146,7 +144,8 @@ class LayeredJob(Job):
         if len(pixels) == 0:
             return
         # Passes of about equal length; neighbouring lanes have neighbouring pixels
-        most = min(_MAX_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
+        samples = device_of(mi.Float).pass_samples // self.integrator.sample_cost
+        most = min(samples, self.plan.most_lanes)
         passes = -(-len(pixels) // max(1, most // count))
         for number, part in enumerate(np.array_split(pixels, passes)):
             if self._stopped(interrupt):

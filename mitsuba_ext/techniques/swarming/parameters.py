@@ -41,8 +41,8 @@ class Swarm(Technique):
     name = "swarm"
     words = {"swarm": {}}
     doubles = True
-    # The learners of all maps together record about 150 bytes for each sample
-    most_lanes = 1 << 21
+    # The learners of all maps together record about 150, in arrays whose sizes are powers of two
+    bytes_per_sample = 256
     summary = ""
 
     def __init__(self, read: ParameterReader, always: bool = False) -> None:

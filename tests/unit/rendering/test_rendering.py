@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering import interrupts, plan
+from mitsuba_ext.rendering import device, interrupts, plan
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.rendering.stages import Learning, Schedule, Stage
@@ -44,8 +44,7 @@ def scene(variant: str) -> mi.Scene:
 @pytest.fixture
 def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples per pixel and pass."""
-    limits = {dr.JitBackend.LLVM: 4 * WIDTH * HEIGHT}
-    monkeypatch.setattr(plan, "_PASS_SAMPLES", limits)
+    monkeypatch.setattr(device, "_CPU_SAMPLES", 4 * WIDTH * HEIGHT)
     monkeypatch.setattr(plan, "_PASS_SPP", 1)
 
 
@@ -85,7 +84,7 @@ class _TwoStages:
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.is_cancelled = False
-        self.name, self.sample_cost, self.most_lanes = "two_stages", 1, 2**32 - 1
+        self.name, self.sample_cost, self.bytes_per_sample = "two_stages", 1, 0
 
     def plan_learning(self, request, spp):
         return Learning((self.pilot_spp,))
@@ -175,7 +174,7 @@ class _Recorder:
 def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scene, sampler):
     """Each pixel has all of its samples, and all of them have numbers of their own."""
     estimator, integrator = _Recorder(), _TwoStages(pilot_spp=1)
-    integrator.most_lanes = 40
+    integrator.bytes_per_sample = device.device_of(mi.Float).pass_bytes / 40
     integrator.schedule = lambda *rest: _Schedule(Stage(estimator), Stage(estimator))
     sensor = mi.load_dict({
         "type": "perspective", "sampler": {"type": sampler},
@@ -221,7 +220,7 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT,
                                     "rfilter": {"type": "box"}}})
-    monkeypatch.setattr(plan, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 8 * WIDTH * HEIGHT})
+    monkeypatch.setattr(device, "_CPU_SAMPLES", 8 * WIDTH * HEIGHT)
     clock = PassClock(monkeypatch)
     integrator = _TwoStages(pilot_spp=25)
     request = Request(scene, sensor, 0, 144, timeout=timeout)

@@ -14,8 +14,8 @@ from ....util.arrays import channel_mean
 from .candidates import Available
 from .technique_observer import TechniqueObserver
 
-#: Largest memory of the images in bytes, and longest paths that they show.
-_MOST_BYTES, _MOST_SEGMENTS = 1 << 29, 8
+#: Longest paths that the images show.
+_MOST_SEGMENTS = 8
 
 #: Words of a pixel of a technique: three colour channels, with and without MIS weights.
 _WORDS = 6
@@ -42,14 +42,17 @@ class TechniqueImages(TechniqueObserver):
         width, height: Its sampled pixels.
         max_depth: Longest path in segments. Paths of more than 8 segments are left out, on large
             films shorter ones as well: :attr:`segments` is the length of the longest paths shown.
+        most_bytes: Largest memory of the images.
     """
 
-    def __init__(self, film: mi.Film, width: int, height: int, max_depth: int) -> None:
+    def __init__(
+        self, film: mi.Film, width: int, height: int, max_depth: int, most_bytes: int
+    ) -> None:
         self._width, self._height = width, height
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
         self._pixels = width * height
         segments = min(max_depth, _MOST_SEGMENTS)
-        while segments > 1 and self._bytes(segments) > _MOST_BYTES:
+        while segments > 1 and self._bytes(segments) > most_bytes:
             segments -= 1
         self.segments = segments
         self._sums = dr.zeros(mi.Float, self._bytes(segments) // 4)

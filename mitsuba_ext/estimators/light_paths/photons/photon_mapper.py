@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ....rendering.device import device_of
 from ....scene.media import may_have_grids
 from ....scene.movers import movers
 from ....transport.estimator import CameraRays, Sample
@@ -21,24 +22,13 @@ from ....transport.path_program import EndingProgram, Subpaths
 from ....transport.walk import Walk
 from ..choice.technique_observer import TechniqueObserver
 from ..light_numbers import LightPathRays
-from ..light_program import StoredHistory
-from ..light_vertices import Layout, LightVertices, PackedVertices, VertexCache, bytes_per_vertex
-from ..light_walk import STRIDE, LightWalk
+from ..light_vertices import LightVertices, PackedVertices, VertexCache
+from ..light_walk import LightWalk
 from ..merging.merging import MergedSubpaths
 from ..merging.merging_radius import MergingRadius
 from ..merging.vertex_grid import VertexGrid
+from ..path_memory import bytes_of_photons
 from .medium_photons import MergedInMedia, PassesThrough
-
-#: The largest number of bytes that a pass may store; and the approximate number of bytes that a
-#: path takes besides the vertices that are stored at a time.
-_PASS_BYTES, _PATH_BYTES = 1 << 29, 512
-
-
-def most_lanes(light_paths: float) -> int:
-    """The largest number of camera paths in a pass, with ``light_paths`` light paths for each."""
-    layout = Layout(len(mi.Spectrum()), StoredHistory(), True)
-    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
-    return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
 
 
 class SpecularPaths(EndingProgram):
@@ -84,7 +74,7 @@ class PhotonMapper:
     @property
     def most_lanes(self) -> int:
         """The largest number of camera paths in a pass."""
-        return most_lanes(self.light_paths)
+        return device_of(mi.Float).lanes(bytes_of_photons(self.light_paths))
 
     def of_coarse_film(self, pixel_width: float) -> PhotonMapper:
         """The mapper for a film with fewer pixels, each as wide as ``pixel_width`` of them."""

@@ -43,8 +43,8 @@ def test_light_paths_are_kept_where_they_find_caustics() -> None:
 
 def test_passes_are_longer_with_few_light_paths() -> None:
     """Camera paths take little memory."""
-    few, one = (bdpt(light_paths=count).most_lanes for count in (1 / 16, 1.0))
-    assert 5 * one < few < 16 * one
+    few, one = (bdpt(light_paths=count).bytes_per_sample for count in (1 / 16, 1.0))
+    assert one / 16 < few < one / 5
 
 
 def test_path_takes_nearly_as_long_where_it_traces_no_shadow_rays() -> None:

@@ -1,0 +1,116 @@
+"""What renders, a CPU or a GPU, and how large its passes may be.
+
+Passes trace Python and launch kernels: fewer and longer passes cost less, until their memory or
+their time is too much. Random numbers depend on the length of passes. Therefore, it follows from
+the size of the memory, and images are the same from render to render on a machine, unless there is
+little free memory.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import drjit as dr
+
+from ..util.memory import Memory, gpu_memory, machine_memory
+
+#: The largest share of the memory for what a pass stores. A CPU shares its memory with other
+#: programs. A GPU loses more time between two passes.
+_CPU_SHARE, _GPU_SHARE = 1 / 28, 1 / 2
+
+#: The memory of a pass on a CPU is at most this number of bytes. (Two cores took 4 % less time for
+#: "bdpt" in glass_lamp, 1280x720, with 1 GiB than with 512 MiB, and no less with 2 or 4 GiB.)
+_MOST_ON_CPU = 1 << 31
+
+#: The memory of a pass is at least this number of bytes, also if less is free.
+_LEAST = 1 << 24
+
+#: The memory of a pass where the memory of the device is not known: on a CPU, and on a GPU.
+_UNKNOWN = {False: 1 << 29, True: 1 << 31}
+
+#: Dr.Jit rounds sizes of arrays up to powers of two, so that a pass takes up to this number of
+#: times the memory that it needs. (Measured in "bdpt", "vcm" and "sppm": 1.6 to 1.75.)
+_ROUNDING = 2
+
+#: Samples per pass, at most. Tracing a pass in Python takes 5 to 70 ms (many materials take
+#: longest). The pass itself takes two or three seconds on two CPU cores, and half a second for
+#: "path" on an H100.
+_CPU_SAMPLES, _GPU_SAMPLES = 1 << 21, 1 << 26
+
+#: Bytes of a sample of a camera path on a GPU, about, with what learners record.
+_CAMERA_BYTES = 128
+
+#: Lanes that a GPU runs together. If they are samples of one pixel, they trace coherent rays, and
+#: the sums that they add to the film are one.
+_WARP = 32
+
+_MAX_WAVEFRONT = (1 << 32) - 1
+
+
+@dataclass(frozen=True)
+class Device:
+    """What renders.
+
+    Attributes:
+        is_gpu: Whether it is a GPU.
+        pass_bytes: The memory for what a pass stores: a power of two.
+    """
+
+    is_gpu: bool
+    pass_bytes: int
+
+    @classmethod
+    def with_memory(cls, is_gpu: bool, memory: Memory | None) -> Device:
+        """The device with this memory; with ``None``, its memory is not known."""
+        if memory is None:
+            return cls(is_gpu, _UNKNOWN[is_gpu])
+        found = _share(is_gpu, memory)
+        while found > _LEAST and _ROUNDING * found > memory.free:
+            found //= 2
+        return cls(is_gpu, found)
+
+    @property
+    def pass_samples(self) -> int:
+        """The number of samples of a pass, if they cost and store no more than paths."""
+        if not self.is_gpu:
+            return _CPU_SAMPLES
+        return min(_GPU_SAMPLES, self.lanes(_CAMERA_BYTES))
+
+    @property
+    def warp(self) -> int:
+        """Of how many samples of a pixel the passes are multiples."""
+        return _WARP if self.is_gpu else 1
+
+    def lanes(self, bytes_per_sample: float) -> int:
+        """The number of samples for which the memory of a pass suffices, at least 1; 0 bytes stand
+        for samples of which nothing is stored."""
+        if bytes_per_sample == 0:
+            return _MAX_WAVEFRONT
+        return max(1, min(_MAX_WAVEFRONT, int(self.pass_bytes / bytes_per_sample)))
+
+
+@functools.cache
+def device_of(kind: type) -> Device:
+    """The device of this type of arrays, such as ``mi.Float``. Its free memory is the free memory
+    of the first call; a render begins with :func:`look_again`."""
+    is_gpu = dr.backend_v(kind) == dr.JitBackend.CUDA
+    read = gpu_memory if is_gpu else machine_memory
+    memory = read()
+    if memory is not None and memory.free < _ROUNDING * _share(is_gpu, memory):
+        # Dr.Jit keeps the memory of former renders
+        dr.flush_malloc_cache()
+        memory = read()
+    return Device.with_memory(is_gpu, memory)
+
+
+def look_again() -> None:
+    """Forgets how much memory was free."""
+    device_of.cache_clear()
+
+
+def _share(is_gpu: bool, memory: Memory) -> int:
+    """The memory of a pass if nothing else needs memory."""
+    share = int(memory.total * (_GPU_SHARE if is_gpu else _CPU_SHARE))
+    found = 1 << max(share.bit_length() - 1, _LEAST.bit_length() - 1)
+    return found if is_gpu else min(found, _MOST_ON_CPU)
