@@ -17,10 +17,15 @@ from ..util.memory import Memory, gpu_memory, machine_memory
 
 #: The largest share of the memory for what a pass stores. A CPU shares its memory with other
 #: programs. A GPU loses more time between two passes.
-_CPU_SHARE, _GPU_SHARE = 1 / 28, 1 / 2
+_CPU_SHARE, _GPU_SHARE = 1 / 28, 1 / 3
+
+#: The binary digits to which the share is rounded down. On a CPU, it is a power of two, so that
+#: most machines have passes of the same length, and thus the same images.
+_CPU_DIGITS, _GPU_DIGITS = 1, 3
 
 #: The memory of a pass on a CPU is at most this number of bytes. (Two cores took 4 % less time for
-#: "bdpt" in glass_lamp, 1280x720, with 1 GiB than with 512 MiB, and no less with 2 or 4 GiB.)
+#: "bdpt" in glass_lamp, 1280x720, with 1 GiB than with 512 MiB, and no less with 2 or 4 GiB. More
+#: cores, with which a machine mostly has more memory, gain more, since one core traces Python.)
 _MOST_ON_CPU = 1 << 31
 
 #: The memory of a pass is at least this number of bytes, also if less is free.
@@ -29,9 +34,10 @@ _LEAST = 1 << 24
 #: The memory of a pass where the memory of the device is not known: on a CPU, and on a GPU.
 _UNKNOWN = {False: 1 << 29, True: 1 << 31}
 
-#: Dr.Jit rounds sizes of arrays up to powers of two, so that a pass takes up to this number of
-#: times the memory that it needs. (Measured in "bdpt", "vcm" and "sppm": 1.6 to 1.75.)
-_ROUNDING = 2
+#: A pass may take this number of times the memory that it needs by the sizes of its arrays, because
+#: Dr.Jit rounds sizes up to powers of two. (Measured at the peak of "bdpt", "vcm", "sppm" and
+#: "light_tracer", in cornell_box and veach-ajar: 1.3 to 2.3.)
+_ROUNDING = 2.5
 
 #: Samples per pass, at most. Tracing a pass in Python takes 5 to 70 ms (many materials take
 #: longest). The pass itself takes two or three seconds on two CPU cores, and half a second for
@@ -54,7 +60,7 @@ class Device:
 
     Attributes:
         is_gpu: Whether it is a GPU.
-        pass_bytes: The memory for what a pass stores: a power of two.
+        pass_bytes: The memory for what a pass stores.
     """
 
     is_gpu: bool
@@ -111,6 +117,8 @@ def look_again() -> None:
 
 def _share(is_gpu: bool, memory: Memory) -> int:
     """The memory of a pass if nothing else needs memory."""
-    share = int(memory.total * (_GPU_SHARE if is_gpu else _CPU_SHARE))
-    found = 1 << max(share.bit_length() - 1, _LEAST.bit_length() - 1)
+    share, digits = (_GPU_SHARE, _GPU_DIGITS) if is_gpu else (_CPU_SHARE, _CPU_DIGITS)
+    found = max(_LEAST, int(share * memory.total))
+    rest = max(0, found.bit_length() - digits)
+    found = found >> rest << rest
     return found if is_gpu else min(found, _MOST_ON_CPU)

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...rendering.device import device_of
 from ...startup.garbage import garbage_left_alone
 from ...transport.estimator import CameraRays
 from ...transport.free_flight import Distances
@@ -25,10 +26,9 @@ from .light_program import LightProgram
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .scattering import delta_correction, evaluate
 
-#: Largest number of vertices of a path that are stored in a round; most paths have fewer. And the
-#: largest number of bytes that the vertices of all paths may take: a round stores fewer if
-#: necessary.
-STRIDE, _STORE_BYTES = 4, 1 << 29
+#: Largest number of vertices of a path that are stored in a round; most paths have fewer. A round
+#: stores fewer if the vertices of all paths would take more than half of the memory of a pass.
+STRIDE = 4
 
 #: Largest number of rounds: a path that is still alive is stuck where nothing absorbs light.
 _MOST_ROUNDS = 1 << 12
@@ -190,7 +190,7 @@ class LightWalk:
         paths = self.begin(scene, numbers, time, wavelengths, active)
         dr.eval(paths)
         bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout)
-        stride = min(STRIDE, max(1, _STORE_BYTES // bytes_per_place))
+        stride = min(STRIDE, max(1, device_of(mi.Float).pass_bytes // 2 // bytes_per_place))
         for _ in range(_MOST_ROUNDS):
             vertices, paths = self.advance(scene, numbers, paths, stride)
             if vertices.count > 0:

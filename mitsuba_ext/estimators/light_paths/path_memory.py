@@ -1,9 +1,7 @@
 """How much memory the paths of a pass take, in bytes.
 
-These are the sizes of arrays. Where bitmap textures or instances need no whole interactions, or
-techniques are not compared, vertices are smaller. In "bdpt", "vcm" and "sppm" at 320x180 and a
-depth of 8 to 16, the peak was 1.6 to 1.75 times the result, because Dr.Jit rounds sizes up to
-powers of two.
+These are the sizes of arrays, for vertices of the largest size: with whole interactions, and with
+the sums of a trial. Dr.Jit rounds the sizes up (``rendering/device.py``).
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from .bidirectional_programs import StoredSums
 from .light_program import StoredHistory
 from .light_vertices import Layout, bytes_per_vertex
 
-#: Vertices of a light path that are stored at a time. Most paths have fewer.
+#: Vertices of a light path that are stored at a time, at least. Most paths have fewer.
 _VERTICES = 4
 
 #: Bytes, about, of the state of a light path; of what is kept of it until the camera paths are
