@@ -19,11 +19,13 @@ from mitsuba_ext.estimators.light_paths.choice.light_paths import (
 from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonChoice, PhotonTrial
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
+from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_both_paths
 from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.rendering.device import Device, device_of
 from mitsuba_ext.scene.bsdfs import has_clear_curves
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
@@ -32,8 +34,9 @@ from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.estimator import Estimator
 from mitsuba_ext.transport.observer import Observer
 
-#: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
-_MOST_PIXELS = 1 << 21
+#: Light paths are not tried in films with more pixels than fit into this number of times the memory
+#: of a pass, on a CPU: a third of its memory. (A pass has at least one sample of each pixel.)
+_EXCESS = 5
 
 
 @registry.plugin
@@ -115,9 +118,10 @@ class Auto(LightPathIntegrator):
     later pilots show their actual variance, with all that was learned for them. If photons would be
     better, they render the last stage. Once photons are chosen, this choice is not tested again.
 
-    Light paths are not tried in films of more than two million pixels, nor if a light cannot emit
-    them: the integrator then works as :class:`auto_path`. In spectral variants and with moving
-    shapes, nothing is merged, and there are no photons in media.
+    Light paths are not tried in films for whose pixels a third of the memory does not suffice (two
+    million pixels with 16 GiB), nor if a light cannot emit them: the integrator then works as
+    :class:`auto_path`. In spectral variants and with moving shapes, nothing is merged, and there
+    are no photons in media.
 
     If vertices are merged, or photons are used, the image is slightly blurred, less with each
     sample (:class:`vcm`, :class:`sppm`).
@@ -175,7 +179,8 @@ class Auto(LightPathIntegrator):
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
         tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
-        if not (tries or plan.restore) or pixel_count > _MOST_PIXELS or not self._can_try(scene):
+        fits = pixel_count <= _most_pixels(device_of(mi.Float))
+        if not (tries or plan.restore) or not fits or not self._can_try(scene):
             return plan
         trial = functools.partial(kind.in_own_stage, film)
         return replace(plan, tries=tries, trial=trial)
@@ -231,3 +236,8 @@ def _can_merge(scene: mi.Scene) -> bool:
     """Only paths of equal wavelengths and times merge: all pixels would have to share these, even
     if nothing is merged in the end."""
     return not (mi.is_spectral or movers(scene))
+
+
+def _most_pixels(device: Device) -> int:
+    """The number of pixels up to which light paths are tried."""
+    return (1 if device.is_gpu else _EXCESS) * device.lanes(bytes_of_both_paths(1.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
@@ -14,6 +15,7 @@ from mitsuba_ext.rendering.device import Device, device_of, look_again
 from mitsuba_ext.rendering.plan import RenderPlan, plan_render
 from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.util.memory import Memory
+from tests.support.paths import ROOT
 from tests.support.stage import stage
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -78,6 +80,15 @@ def test_a_device_of_unknown_memory_has_passes_that_fit_nearly_everywhere() -> N
     assert Device.with_memory(True, None).pass_bytes == 2 * GiB
 
 
+@pytest.fixture
+def looks_again() -> Iterator[None]:
+    """The device is looked at in this test, and in the next one."""
+    look_again()
+    yield
+    look_again()
+
+
+@pytest.mark.usefixtures("looks_again")
 def test_memory_that_former_renders_hold_is_given_back_where_little_is_free(monkeypatch) -> None:
     flushed: list[int] = []
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: flushed.append(1))
@@ -85,14 +96,10 @@ def test_memory_that_former_renders_hold_is_given_back_where_little_is_free(monk
         monkeypatch.setattr(
             devices, read, lambda: Memory(16 * GiB, GiB // 8 + 3 * GiB * len(flushed))
         )
-    look_again()
-    try:
-        for _ in range(2):
-            is_gpu = device_of(mi.Float).is_gpu
-            assert device_of(mi.Float).pass_bytes == (5 * GiB // 4 if is_gpu else 512 * MiB)
-        assert len(flushed) == 1, "once in a render"
-    finally:
-        look_again()
+    for _ in range(2):
+        is_gpu = device_of(mi.Float).is_gpu
+        assert device_of(mi.Float).pass_bytes == (5 * GiB // 4 if is_gpu else 512 * MiB)
+    assert len(flushed) == 1, "once in a render"
 
 
 def test_bidirectional_passes_on_a_large_gpu_are_few() -> None:
@@ -149,3 +156,23 @@ def test_paths_on_a_gpu_need_few_passes() -> None:
 def test_passes_of_a_structured_sampler_on_a_gpu_have_equal_lengths() -> None:
     plan = _plan(H100, "composed_path", (1280, 720), 96, sampler="stratified")
     assert plan.spp % plan.pass_length(plan.spp) == 0 and _runs(plan, plan.spp) <= 3
+
+
+@pytest.mark.usefixtures("looks_again")
+@pytest.mark.parametrize("total, size, tries", [
+    (3.8, (640, 480), True), (3.8, (1280, 720), False), (15.3, (1920, 1080), True),
+    (15.3, (2048, 1536), False), (252, (3840, 2160), True),
+])  # fmt: skip
+def test_auto_tries_light_paths_where_memory_has_room_for_all_pixels(
+    total: float, size: tuple[int, int], tries: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Memory(int(total * GiB), int(total * GiB))
+    for read in ("gpu_memory", "machine_memory"):
+        monkeypatch.setattr(devices, read, lambda: memory)
+    if device_of(mi.Float).is_gpu:
+        pytest.skip("numbers of a CPU")
+    scene = mi.load_file(str(ROOT / "scenes" / "rooms.xml"), width=size[0], height=size[1])
+    learning = mi.load_dict({"type": "auto", "max_depth": 8}).plan_learning(
+        Request(scene, scene.sensors()[0], 0, 256), 256
+    )
+    assert (learning.trial is not None) == tries

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import device, interrupts, plan
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.request import Request
@@ -236,6 +237,55 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     pilot = round(done * (3 - image.mean()) / 2)
     assert image == pytest.approx((pilot * 1 + (done - pilot) * 3) / done)
     assert pilot <= 0.25 * done + 2
+
+
+@pytest.fixture
+def passes_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most 64 samples per pixel and pass, in whole warps."""
+    gpu = device.Device(True, 64 * WIDTH * HEIGHT * 128)
+    monkeypatch.setattr(rendering, "device_of", lambda kind: gpu)
+
+
+@pytest.mark.usefixtures("passes_of_a_gpu")
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+@pytest.mark.parametrize(
+    "name, spp", [("composed_path", 100), ("neepp", 128), ("auto", 128), ("bdpt", 100)]
+)
+def test_passes_of_whole_warps_take_all_samples(scene, name, spp, sampler, monkeypatch):
+    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
+                           "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
+    integrator, told = _path(name), []
+    integrator.progress = told.append
+    assert np.isfinite(integrator.render(scene, sensor, spp=spp).numpy()).all()
+    assert integrator.statistics.spp == spp
+    assert told == sorted(told) and told[-1] == 1
+
+
+@pytest.mark.usefixtures("passes_of_a_gpu")
+@pytest.mark.parametrize("timeout", [3.0, 8.0, 1000.0])
+def test_passes_of_whole_warps_keep_the_timeout(scene, monkeypatch, timeout):
+    clock = PassClock(monkeypatch)
+    integrator = _TwoStages(pilot_spp=25, timeout=timeout)
+    integrator.render(scene, 144)
+    assert integrator.statistics.spp == round(clock.now / 0.1)
+    assert integrator.statistics.spp == 144 or timeout * 0.9 <= clock.now <= timeout * 1.05
+
+
+@pytest.mark.usefixtures("passes_of_a_gpu")
+@pytest.mark.parametrize("name", ["adaptive", "variance"])
+def test_passes_of_whole_warps_serve_adaptive_sampling_and_variances(scene, name):
+    nested = {"type": "composed_path", "max_depth": 3}
+    image = mi.load_dict({"type": name, "nested": nested}).render(scene, spp=200).numpy()
+    assert np.isfinite(image).all() and image.max() > 0
+
+
+@pytest.mark.usefixtures("passes_of_a_gpu")
+def test_a_render_in_whole_warps_can_be_cancelled(scene):
+    integrator = _path()
+    integrator.progress = lambda fraction: integrator.cancel()
+    integrator.render(scene, spp=200)
+    assert integrator.statistics.interrupted and integrator.statistics.spp == 64
 
 
 def test_compilation_counts_towards_the_timeout_but_not_as_speed(scene, monkeypatch):
