@@ -25,7 +25,7 @@ from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
-from mitsuba_ext.rendering.device import Device, device_of
+from mitsuba_ext.rendering.device import SampleBytes, device_of
 from mitsuba_ext.scene.bsdfs import has_clear_curves
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
@@ -163,9 +163,9 @@ class Auto(LightPathIntegrator):
         return 1
 
     @property
-    def bytes_per_sample(self) -> float:
+    def sample_bytes(self) -> SampleBytes:
         # Stages with light paths have limits of their own
-        return 0
+        return SampleBytes()
 
     def plan_learning(self, request, spp, kernels=math.inf):
         scene, film = request.scene, request.sensor.film()
@@ -179,7 +179,7 @@ class Auto(LightPathIntegrator):
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
         tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
-        fits = pixel_count <= _most_pixels(device_of(mi.Float))
+        fits = pixel_count <= self._most_pixels
         if not (tries or plan.restore) or not fits or not self._can_try(scene):
             return plan
         trial = functools.partial(kind.in_own_stage, film)
@@ -212,6 +212,13 @@ class Auto(LightPathIntegrator):
     def merging_radius(self, request, side, *sums):
         return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None
 
+    @property
+    def _most_pixels(self) -> int:
+        """The number of pixels up to which light paths are tried."""
+        device = device_of(mi.Float)
+        fits = device.lanes(bytes_of_both_paths(1.0, self.max_depth))
+        return fits if device.is_gpu else _EXCESS * fits
+
     def _can_try(self, scene: mi.Scene) -> bool:
         """Whether light paths can be tried in the scene."""
         if self.max_depth < 2:
@@ -236,8 +243,3 @@ def _can_merge(scene: mi.Scene) -> bool:
     """Only paths of equal wavelengths and times merge: all pixels would have to share these, even
     if nothing is merged in the end."""
     return not (mi.is_spectral or movers(scene))
-
-
-def _most_pixels(device: Device) -> int:
-    """The number of pixels up to which light paths are tried."""
-    return (1 if device.is_gpu else _EXCESS) * device.lanes(bytes_of_both_paths(1.0))

@@ -6,13 +6,13 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
-from mitsuba_ext.estimators.light_paths.light_program import StoredHistory
 from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
-from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_light_path
+from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_connected_path
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
 from mitsuba_ext.rendering.camera import check_takes_splats
+from mitsuba_ext.rendering.device import SampleBytes
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import sensor_at_rest
@@ -116,8 +116,8 @@ class LightTracerIntegrator(WalkIntegrator):
         return 2
 
     @property
-    def bytes_per_sample(self) -> float:
-        return bytes_of_light_path(StoredHistory(), kept=False)
+    def sample_bytes(self) -> SampleBytes:
+        return bytes_of_connected_path()
 
     @property
     def needs_equal_samples(self) -> str:

@@ -14,6 +14,7 @@ from mitsuba_ext.estimators.light_paths.merging.merging_parameters import (
 )
 from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_photons
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
+from mitsuba_ext.rendering.device import SampleBytes
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.decisions import CameraSamples, Decisions
@@ -129,8 +130,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
         return max(3, math.ceil(self.light_paths))
 
     @property
-    def bytes_per_sample(self) -> float:
-        return bytes_of_photons(self.light_paths)
+    def sample_bytes(self) -> SampleBytes:
+        return bytes_of_photons(self.light_paths, self.max_depth)
 
     def schedule(self, request, samples, learning) -> OneStage:
         scene = request.scene

@@ -27,7 +27,7 @@ from ..estimators.light_paths.path_memory import bytes_of_both_paths
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
 from ..images import image_files
 from ..rendering.camera import film_extent
-from ..rendering.device import device_of
+from ..rendering.device import SampleBytes, device_of
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule
 from ..rendering.statistics import RenderStatistics
@@ -74,8 +74,9 @@ class LightPathIntegrator(WalkIntegrator):
         return max(3, super().sample_cost)
 
     @property
-    def bytes_per_sample(self) -> float:
-        return bytes_of_both_paths(getattr(self.slots.get("light_paths"), "count", 1.0))
+    def sample_bytes(self) -> SampleBytes:
+        count = getattr(self.slots.get("light_paths"), "count", 1.0)
+        return bytes_of_both_paths(count, self.max_depth)
 
     def connects_to(self, scene: mi.Scene, sensor: mi.Sensor) -> bool:
         """Whether all lights of the scene can emit light paths, and the sensor receives them."""
@@ -193,11 +194,12 @@ class LightPathEstimators:
             radius = self.radius(walk.next_event, compares)
         if radius is not None and choice.pixel_width > 1:
             radius = radius.of_coarse_film(choice.pixel_width)
+        sample_bytes = bytes_of_both_paths(techniques.light_paths, integrator.max_depth)
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
             merges_all=integrator.merges_all, light_paths=techniques.light_paths,
-            most_lanes=device_of(mi.Float).lanes(bytes_of_both_paths(techniques.light_paths)),
+            most_lanes=device_of(mi.Float).lanes(sample_bytes),
         )  # fmt: skip
 
 

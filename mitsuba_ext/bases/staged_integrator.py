@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..long_renders.intervals import Interval
 from ..rendering import camera
 from ..rendering import render as rendering
+from ..rendering.device import SampleBytes
 from ..rendering.interrupts import interrupted
 from ..rendering.request import Request
 from ..rendering.stages import Learning, Schedule, Stage
@@ -109,9 +110,9 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return 1
 
     @property
-    def bytes_per_sample(self) -> float:
-        """The approximate memory of a sample in a pass; 0 if it needs no more than a path."""
-        return 0
+    def sample_bytes(self) -> SampleBytes:
+        """The memory of a sample in a pass."""
+        return SampleBytes()
 
     def samples_per_set(self, spp: int) -> int:
         """How many of the ``spp`` samples of a pixel form a set, in a render with a timeout, which

@@ -10,6 +10,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.staged import is_staged
 from ..rendering.stages import Learning, OneStage, Schedule, Stage
@@ -85,8 +86,8 @@ class WrappingIntegrator(StagedIntegrator):
         return self.nested.sample_cost if self._is_staged else 1
 
     @property
-    def bytes_per_sample(self) -> float:
-        return self.nested.bytes_per_sample if self._is_staged else 0
+    def sample_bytes(self) -> SampleBytes:
+        return self.nested.sample_bytes if self._is_staged else super().sample_bytes
 
     @property
     def needs_equal_samples(self) -> str:

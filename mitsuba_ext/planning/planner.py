@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..rendering.device import device_of
+from ..rendering.device import SampleBytes, device_of
 from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..transport.decisions import Decisions
@@ -108,7 +108,7 @@ class Planner(Schedule):
         self._doubles = any(technique.doubles for technique in learning_ones)
         self._only_doubles = all(technique.doubles for technique in learning_ones)
         recorded = max((t.bytes_per_sample for t in learning_ones), default=0)
-        self._most_lanes = device_of(mi.Float).lanes(recorded) if recorded else 0
+        self._most_lanes = device_of(mi.Float).lanes(SampleBytes(recorded)) if recorded else 0
         #: For each stage, the weight of its samples relative to the last stage
         self._weights = stage_weights(stages) if self._doubles else [1.0] * len(stages)
         self._learning, self._savers = learning, savers

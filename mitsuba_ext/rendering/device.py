@@ -53,6 +53,24 @@ _WARP = 32
 
 _MAX_WAVEFRONT = (1 << 32) - 1
 
+#: The size of the largest array of a pass where paths are long, in units of the memory of a pass. (A
+#: CPU has 28 times that memory, a GPU three times.) And its size in bytes: Dr.Jit's arrays have at
+#: most 2^32 entries.
+_CPU_ARRAY, _GPU_ARRAY, _ARRAY_BYTES = 8.0, 2 / 3, 4 * _MAX_WAVEFRONT
+
+
+@dataclass(frozen=True)
+class SampleBytes:
+    """The memory of a sample in a pass, as far as it depends on the number of samples.
+
+    Attributes:
+        usual: Its bytes, about; 0 if it stores no more than a path.
+        largest: Its bytes in the largest array, in scenes whose paths are as long as they can be.
+    """
+
+    usual: float = 0.0
+    largest: float = 0.0
+
 
 @dataclass(frozen=True)
 class Device:
@@ -81,19 +99,28 @@ class Device:
         """The number of samples of a pass, if they cost and store no more than paths."""
         if not self.is_gpu:
             return _CPU_SAMPLES
-        return min(_GPU_SAMPLES, self.lanes(_CAMERA_BYTES))
+        return min(_GPU_SAMPLES, self.lanes(SampleBytes(_CAMERA_BYTES)))
+
+    @property
+    def round_bytes(self) -> int:
+        """The memory for what a kernel stores before it is known how much of it is needed."""
+        return min(self.pass_bytes // 2, _ARRAY_BYTES)
 
     @property
     def warp(self) -> int:
         """Of how many samples of a pixel the passes are multiples."""
         return _WARP if self.is_gpu else 1
 
-    def lanes(self, bytes_per_sample: float) -> int:
-        """The number of samples for which the memory of a pass suffices, at least 1; 0 bytes stand
-        for samples of which nothing is stored."""
-        if bytes_per_sample == 0:
-            return _MAX_WAVEFRONT
-        return max(1, min(_MAX_WAVEFRONT, int(self.pass_bytes / bytes_per_sample)))
+    def lanes(self, sample: SampleBytes) -> int:
+        """The number of samples for which the memory of a pass suffices, at least 1."""
+        found: float = _MAX_WAVEFRONT
+        if sample.usual > 0:
+            found = min(found, self.pass_bytes / sample.usual)
+        if sample.largest > 0:
+            share = _GPU_ARRAY if self.is_gpu else _CPU_ARRAY
+            array = min(share * self.pass_bytes, _ARRAY_BYTES)
+            found = min(found, array / sample.largest)
+        return max(1, int(found))
 
 
 @functools.cache

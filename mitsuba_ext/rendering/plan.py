@@ -119,7 +119,7 @@ def plan_render(
     check_extent(film)
     pixel_count = math.prod(film_extent(film))
     structured = not is_independent(request.sensor)
-    cost, most_lanes = integrator.sample_cost, device.lanes(integrator.bytes_per_sample)
+    cost, most_lanes = integrator.sample_cost, device.lanes(integrator.sample_bytes)
     limit = device.pass_samples // (pixel_count * cost)
     if not structured and not device.is_gpu:
         limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))

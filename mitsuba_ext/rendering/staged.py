@@ -7,6 +7,7 @@ from typing import Protocol
 
 import mitsuba as mi
 
+from .device import SampleBytes
 from .request import Request
 from .stages import Learning, Schedule, Stage
 from .statistics import RenderStatistics
@@ -30,8 +31,8 @@ class Staged(Protocol):
         """The approximate time of a sample, in units of the time of a path."""
 
     @property
-    def bytes_per_sample(self) -> float:
-        """The approximate memory of a sample in a pass; 0 if it needs no more than a path."""
+    def sample_bytes(self) -> SampleBytes:
+        """The memory of a sample in a pass."""
 
     def samples_per_set(self, spp: int) -> int:
         """The number of samples of a pixel that a timeout must not separate."""

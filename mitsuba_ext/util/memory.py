@@ -83,9 +83,10 @@ def _control_groups(root: Path) -> list[Memory]:
     for line in _read(root / "proc/self/cgroup").splitlines():
         number, controllers, path = line.split(":", 2)
         if number == "0":
-            top, names, files = "sys/fs/cgroup", ("memory.max", "memory.current"), "inactive_file"
+            top, cached = "sys/fs/cgroup", "inactive_file"
+            names = ("memory.max", "memory.current")
         elif "memory" in controllers.split(","):
-            top, files = "sys/fs/cgroup/memory", "total_inactive_file"
+            top, cached = "sys/fs/cgroup/memory", "total_inactive_file"
             names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
         else:
             continue
@@ -97,7 +98,8 @@ def _control_groups(root: Path) -> list[Memory]:
                 continue
             # The system drops cached files where memory is needed
             stat = dict(line.split()[:2] for line in _read(folder / "memory.stat").splitlines())
-            found.append(Memory(int(limit), int(limit) - int(used) + int(stat.get(files, 0))))
+            free = int(limit) - int(used) + int(stat.get(cached, 0))
+            found.append(Memory(int(limit), free))
     return found
 
 

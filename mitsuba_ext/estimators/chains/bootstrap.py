@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...rendering.device import device_of
+from ...rendering.device import SampleBytes, device_of
 from ...transport.numbers import BothEnds, Numbers
 from ...util.arrays import from_numpy
 from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator, stream
@@ -55,7 +55,7 @@ class Bootstrap:
         self._cells = math.isqrt(count - 1) + 1
         self.count = self._cells**2
         # Parts of equal width, which share kernels
-        most = device_of(mi.Float).lanes(_BYTES[target.has_light_paths])
+        most = device_of(mi.Float).lanes(SampleBytes(_BYTES[target.has_light_paths]))
         parts = -(-self.count // most)
         width, values = -(-self.count // parts), []
         for part in range(parts):

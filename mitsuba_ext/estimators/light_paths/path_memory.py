@@ -8,33 +8,45 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ...rendering.device import SampleBytes
 from .bidirectional_programs import StoredSums
 from .light_program import StoredHistory
 from .light_vertices import Layout, bytes_per_vertex
 
 #: Vertices of a light path that are stored at a time, at least. Most paths have fewer.
-_VERTICES = 4
+_STORED = 4
 
-#: Bytes, about, of the state of a light path; of what is kept of it until the camera paths are
-#: traced; and of a camera path.
+#: The largest mean number of vertices of light paths, about, in scenes where they are long.
+_LONGEST = 32
+
+#: Bytes, about, of the state of a light path; of its vertices, as far as they are kept until the
+#: camera paths are traced; and of a camera path.
 _STATE, _KEPT, _CAMERA = 256, 256, 128
 
 
-def bytes_of_light_path(history: StoredHistory, kept: bool = True) -> int:
-    """
-    Parameters:
-        history: How its history is stored.
-        kept: Whether its vertices are kept, without gaps, until camera paths are traced.
-    """
-    layout = Layout(len(mi.Spectrum()), history, True)
-    return _VERTICES * bytes_per_vertex(layout) + _STATE + (_KEPT if kept else 0)
-
-
-def bytes_of_both_paths(light_paths: float) -> float:
+def bytes_of_both_paths(light_paths: float, max_depth: int) -> SampleBytes:
     """A camera path, and ``light_paths`` light paths that are connected to it or merged with it."""
-    return light_paths * bytes_of_light_path(StoredSums(5)) + _CAMERA
+    found = _light_path(StoredSums(5), max_depth)
+    return SampleBytes(light_paths * found.usual + _CAMERA, light_paths * found.largest)
 
 
-def bytes_of_photons(light_paths: float) -> float:
+def bytes_of_photons(light_paths: float, max_depth: int) -> SampleBytes:
     """A camera path, and ``light_paths`` light paths whose vertices are photons."""
-    return max(1.0, light_paths) * bytes_of_light_path(StoredHistory())
+    found, count = _light_path(StoredHistory(), max_depth), max(1.0, light_paths)
+    return SampleBytes(count * found.usual, count * found.largest)
+
+
+def bytes_of_connected_path() -> SampleBytes:
+    """A light path whose vertices are connected to the sensor, and not kept."""
+    return SampleBytes(_STORED * _vertex(StoredHistory()) + _STATE)
+
+
+def _light_path(history: StoredHistory, max_depth: int) -> SampleBytes:
+    """A light path with this history, whose vertices are kept."""
+    vertex = _vertex(history)
+    most = min(_LONGEST, max(1, max_depth - 1))
+    return SampleBytes(_STORED * vertex + _STATE + _KEPT, most * vertex)
+
+
+def _vertex(history: StoredHistory) -> int:
+    return bytes_per_vertex(Layout(len(mi.Spectrum()), history, True))

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering.device import device_of
+from mitsuba_ext.rendering.device import SampleBytes, device_of
 from tests.support.bdpt import assert_image_of_path, bdpt
 from tests.support.emitters_and_materials import (
     EMITTERS,
@@ -146,8 +146,8 @@ def test_parts_of_the_film_share_the_light_of_all_light_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = mi.load_dict(stage(camera=below_the_lamp(film=film(48, 48))))
-    most = device_of(mi.Float).pass_bytes / (48 * 48 // 2)
-    monkeypatch.setattr(type(bdpt()), "bytes_per_sample", most)
+    half = SampleBytes(device_of(mi.Float).pass_bytes / (48 * 48 // 2))
+    monkeypatch.setattr(type(bdpt()), "sample_bytes", half)
     assert_image_of_path(scene, spp=8)
 
 

@@ -36,7 +36,7 @@ def _plan(device: Device, name: str, size: tuple[int, int], spp: int, **parts: A
         "type": "perspective", "sampler": {"type": parts.pop("sampler", "independent")},
         "film": {"type": "hdrfilm", "width": size[0], "height": size[1]},
     })  # fmt: skip
-    integrator = mi.load_dict({"type": name, "max_depth": 8, **parts})
+    integrator = mi.load_dict({"type": name, **{"max_depth": 8, **parts}})
     request = Request(mi.load_dict(stage()), sensor, 0, spp, timeout=-1)
     return plan_render(integrator, request, sensor.sampler(), device)
 
@@ -129,9 +129,28 @@ def test_passes_on_a_cpu_are_what_they_were() -> None:
 @pytest.mark.parametrize("light_paths, at_most", [(1, 8), (4, 32)])
 def test_stages_with_many_light_paths_have_shorter_passes(light_paths: int, at_most: int) -> None:
     plan = _plan(H100, "composed_path", (1280, 720), 128)
-    most = H100.lanes(bytes_of_both_paths(light_paths))
+    most = H100.lanes(bytes_of_both_paths(light_paths, 8))
     length = plan.pass_length(128, most)
     assert -(-128 // length) <= at_most and length * 1280 * 720 <= most
+
+
+@pytest.mark.parametrize("name", ["bdpt", "vcm", "sppm"])
+@pytest.mark.parametrize("max_depth, length", [(4, 16), (8, 16), (16, 4), (-1, 2)])
+def test_passes_on_a_gpu_have_room_for_long_paths(name: str, max_depth: int, length: int) -> None:
+    """The vertices of all light paths are in one array, which has less than 2^32 words."""
+    plan = _plan(H100, name, (1280, 720), 128, max_depth=max_depth)
+    assert plan.pass_length(128) == length
+    vertices = 31 if max_depth < 0 else max_depth - 1
+    assert 1280 * 720 * length * vertices * 40 < 1 << 32
+
+
+def test_passes_on_a_cpu_do_not_depend_on_the_length_of_paths() -> None:
+    """A CPU has much more memory than a pass takes."""
+    lengths = [
+        _plan(CPU, "bdpt", (320, 180), 128, max_depth=depth).pass_length(128)
+        for depth in (4, 16, -1)
+    ]
+    assert lengths == [7, 7, 7]
 
 
 @pytest.mark.parametrize("spp", [1, 5, 31, 32, 40, 64, 100, 128, 1000])

@@ -85,7 +85,7 @@ class _TwoStages:
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.is_cancelled = False
-        self.name, self.sample_cost, self.bytes_per_sample = "two_stages", 1, 0
+        self.name, self.sample_cost, self.sample_bytes = "two_stages", 1, device.SampleBytes()
 
     def plan_learning(self, request, spp):
         return Learning((self.pilot_spp,))
@@ -175,7 +175,7 @@ class _Recorder:
 def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scene, sampler):
     """Each pixel has all of its samples, and all of them have numbers of their own."""
     estimator, integrator = _Recorder(), _TwoStages(pilot_spp=1)
-    integrator.bytes_per_sample = device.device_of(mi.Float).pass_bytes / 40
+    integrator.sample_bytes = device.SampleBytes(device.device_of(mi.Float).pass_bytes / 40)
     integrator.schedule = lambda *rest: _Schedule(Stage(estimator), Stage(estimator))
     sensor = mi.load_dict({
         "type": "perspective", "sampler": {"type": sampler},

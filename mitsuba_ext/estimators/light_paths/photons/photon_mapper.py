@@ -74,7 +74,8 @@ class PhotonMapper:
     @property
     def most_lanes(self) -> int:
         """The largest number of camera paths in a pass."""
-        return device_of(mi.Float).lanes(bytes_of_photons(self.light_paths))
+        sample_bytes = bytes_of_photons(self.light_paths, self.walk.max_depth)
+        return device_of(mi.Float).lanes(sample_bytes)
 
     def of_coarse_film(self, pixel_width: float) -> PhotonMapper:
         """The mapper for a film with fewer pixels, each as wide as ``pixel_width`` of them."""

@@ -43,7 +43,7 @@ def test_light_paths_are_kept_where_they_find_caustics() -> None:
 
 def test_passes_are_longer_with_few_light_paths() -> None:
     """Camera paths take little memory."""
-    few, one = (bdpt(light_paths=count).bytes_per_sample for count in (1 / 16, 1.0))
+    few, one = (bdpt(light_paths=count).sample_bytes.usual for count in (1 / 16, 1.0))
     assert one / 16 < few < one / 5
 
 
