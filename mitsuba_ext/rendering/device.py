@@ -23,9 +23,13 @@ _CPU_SHARE, _GPU_SHARE = 1 / 28, 1 / 3
 #: most machines have passes of the same length, and thus the same images.
 _CPU_DIGITS, _GPU_DIGITS = 1, 3
 
+#: The memory of a pass on a GPU is at most this number of bytes: half of it, which one array may
+#: have, is less than 2^32 words.
+_MOST_ON_GPU = 7 << 32
+
 #: The memory of a pass on a CPU is at most this number of bytes. (Two cores took 4 % less time for
 #: "bdpt" in glass_lamp, 1280x720, with 1 GiB than with 512 MiB, and no less with 2 or 4 GiB. More
-#: cores, with which a machine mostly has more memory, gain more, since one core traces Python.)
+#: cores probably gain more, since only one of them traces Python: this was not measured.)
 _MOST_ON_CPU = 1 << 31
 
 #: The memory of a pass is at least this number of bytes, also if less is free.
@@ -48,14 +52,14 @@ _CPU_SAMPLES, _GPU_SAMPLES = 1 << 21, 1 << 26
 _CAMERA_BYTES = 128
 
 #: Lanes that a GPU runs together. If they are samples of one pixel, they trace coherent rays, and
-#: the sums that they add to the film are one.
+#: Dr.Jit can add them to the film as one sum.
 _WARP = 32
 
 _MAX_WAVEFRONT = (1 << 32) - 1
 
-#: The size of the largest array of a pass where paths are long, in units of the memory of a pass. (A
-#: CPU has 28 times that memory, a GPU three times.) And its size in bytes: Dr.Jit's arrays have at
-#: most 2^32 entries.
+#: The size of the largest array of a pass where paths are long, in units of the memory of a pass: a
+#: CPU has 28 times that memory, and a GPU three times. And its size in bytes: the arrays of Dr.Jit
+#: have at most 2^32 entries.
 _CPU_ARRAY, _GPU_ARRAY, _ARRAY_BYTES = 8.0, 2 / 3, 4 * _MAX_WAVEFRONT
 
 
@@ -102,11 +106,6 @@ class Device:
         return min(_GPU_SAMPLES, self.lanes(SampleBytes(_CAMERA_BYTES)))
 
     @property
-    def round_bytes(self) -> int:
-        """The memory for what a kernel stores before it is known how much of it is needed."""
-        return min(self.pass_bytes // 2, _ARRAY_BYTES)
-
-    @property
     def warp(self) -> int:
         """Of how many samples of a pixel the passes are multiples."""
         return _WARP if self.is_gpu else 1
@@ -148,4 +147,4 @@ def _share(is_gpu: bool, memory: Memory) -> int:
     found = max(_LEAST, int(share * memory.total))
     rest = max(0, found.bit_length() - digits)
     found = found >> rest << rest
-    return found if is_gpu else min(found, _MOST_ON_CPU)
+    return min(found, _MOST_ON_GPU if is_gpu else _MOST_ON_CPU)

@@ -190,7 +190,7 @@ class LightWalk:
         paths = self.begin(scene, numbers, time, wavelengths, active)
         dr.eval(paths)
         bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout)
-        stride = min(STRIDE, max(1, device_of(mi.Float).round_bytes // bytes_per_place))
+        stride = min(STRIDE, max(1, device_of(mi.Float).pass_bytes // 2 // bytes_per_place))
         for _ in range(_MOST_ROUNDS):
             vertices, paths = self.advance(scene, numbers, paths, stride)
             if vertices.count > 0:

@@ -60,7 +60,8 @@ def test_passes_on_a_cpu_follow_its_memory(total: float, expected: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("total", "expected"), [(3.9, 1.25), (7.7, 2.5), (11.6, 3.5), (23.5, 7), (39.4, 12), (79.2, 24)]
+    ("total", "expected"),
+    [(3.9, 1.25), (7.7, 2.5), (11.6, 3.5), (23.5, 7), (39.4, 12), (79.2, 24), (140, 28)],
 )
 def test_passes_on_a_gpu_take_nearly_a_third_of_its_memory(total: float, expected: int) -> None:
     assert _device(True, total).pass_bytes == expected * GiB
