@@ -45,7 +45,8 @@ def scene(variant: str) -> mi.Scene:
 @pytest.fixture
 def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples per pixel and pass."""
-    monkeypatch.setattr(device, "_CPU_SAMPLES", 4 * WIDTH * HEIGHT)
+    for name in ("_CPU_SAMPLES", "_GPU_SAMPLES"):
+        monkeypatch.setattr(device, name, 4 * WIDTH * HEIGHT)
     monkeypatch.setattr(plan, "_PASS_SPP", 1)
 
 
@@ -221,7 +222,8 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT,
                                     "rfilter": {"type": "box"}}})
-    monkeypatch.setattr(device, "_CPU_SAMPLES", 8 * WIDTH * HEIGHT)
+    for name in ("_CPU_SAMPLES", "_GPU_SAMPLES"):
+        monkeypatch.setattr(device, name, 8 * WIDTH * HEIGHT)
     clock = PassClock(monkeypatch)
     integrator = _TwoStages(pilot_spp=25)
     request = Request(scene, sensor, 0, 144, timeout=timeout)
