@@ -93,7 +93,7 @@ def row_of(light_map: LightMap, values: mi.Float) -> np.ndarray:
 
 def learner_of(scene: mi.Scene, **parameters) -> LightMapLearner:
     defaults = {"target": "contribution", "grid": 0, "max_memory": 2**26,
-                "pilot_samples": 100_000, "film_width": 64}
+                "pilot_samples": 100_000, "film_size": (64, 64)}
     learner = LightMapLearner(**{**defaults, **parameters})
     learner.start(scene, *vertices())
     return learner

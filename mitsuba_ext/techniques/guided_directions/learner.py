@@ -86,7 +86,7 @@ class GuideLearner(Learner):
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
-        self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
+        self._film_size, self._pixels = film_size, PixelEstimates(*film_size)
         self.pixel_count = film_size[0] * film_size[1]
         #: The time of a sample, relative to ``path`` without guides
         self._time = 1.0

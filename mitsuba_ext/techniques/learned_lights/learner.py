@@ -61,7 +61,7 @@ class LightMapLearner(Learner):
             of pilot samples.
         max_memory: Bytes that the map may take.
         pilot_samples: Samples of all pilots together.
-        film_width: Pixels of a row of the film, with its border where that is sampled.
+        film_size: Width and height of the film in pixels, with its border where that is sampled.
         render_samples: Samples of the render, pilots included.
 
     Attributes:
@@ -76,13 +76,13 @@ class LightMapLearner(Learner):
         grid: int,
         max_memory: int,
         pilot_samples: int,
-        film_width: int,
+        film_size: tuple[int, int],
         render_samples: float = math.inf,
     ) -> None:
         self.target, self.grid = target, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
         self.render_samples = render_samples
-        self._pixels = PixelEstimates(film_width)
+        self._pixels = PixelEstimates(*film_size)
         self._is_needed = grid > 0
         self.map: LightMap | None = None
         self._records: ConnectionRecords | None = None

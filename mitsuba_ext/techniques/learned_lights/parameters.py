@@ -45,7 +45,7 @@ class LearnedLights(Technique):
             self.grid,
             int(self.max_memory * 2**20),
             setting.pilot_samples,
-            film_extent(setting.sensor.film())[0],
+            film_extent(setting.sensor.film()),
             setting.pixel_count * setting.spp,
         )
 

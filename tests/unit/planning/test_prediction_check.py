@@ -111,7 +111,7 @@ def test_a_given_weight_lets_rare_bright_samples_count() -> None:
 
 def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
     """The pilots hold none of these paths: they show the trial's variance of ``path`` only."""
-    learner = LightMapLearner("contribution", 0, 1 << 20, 1 << 10, _SIZE)
+    learner = LightMapLearner("contribution", 0, 1 << 20, 1 << 10, (_SIZE, _SIZE))
     learner.removed, learner._is_kept = 3.0, True
     learner.set_variance(variance=297.0, trimmed=1.0)
     effect = learner.effect.as_dict()

@@ -42,7 +42,7 @@ class LearnedSubpaths(Technique):
         return RegionLearner(
             lambda: _light_vertices(setting),
             setting.pilot_samples,
-            film_extent(setting.sensor.film())[0],
+            film_extent(setting.sensor.film()),
         )
 
 

@@ -60,16 +60,17 @@ class RegionLearner(Learner):
     Parameters:
         light_vertices: Traces light paths.
         pilot_samples: Samples of all pilots together.
-        film_width: Pixels of a row of the film, with its border where that is sampled.
+        film_size: Width and height of the film in pixels, with its border where that is sampled.
     """
 
     wants_scout = True
 
     def __init__(
-        self, light_vertices: Callable[[], LightVertexSample], pilot_samples: int, film_width: int
-    ) -> None:
+        self, light_vertices: Callable[[], LightVertexSample], pilot_samples: int,
+        film_size: tuple[int, int],
+    ) -> None:  # fmt: skip
         self._light_vertices, self._pilot_samples = light_vertices, pilot_samples
-        self._pixels = PixelEstimates(film_width)
+        self._pixels = PixelEstimates(*film_size)
         self._records: PairRecords | None = None
         self._summary = ""
 

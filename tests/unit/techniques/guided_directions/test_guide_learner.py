@@ -246,7 +246,7 @@ def test_memory_is_bounded_where_no_path_ends() -> None:
 def test_importance_follows_the_place_in_the_image() -> None:
     """Errors are relative to the mean of the pixels around, and to little of all."""
     width, count = 32, 4
-    pixels = PixelEstimates(width)
+    pixels = PixelEstimates(width, width)
     records = PathRecords(lambda si, pixel, active: pixel, bounces=2, stride=1, pixels=pixels)
     # The right half of the film is brighter; paths bring half or three halves of that
     radiance = np.where(np.arange(width) < width // 2, 1.0, 4.0)[None].repeat(width, axis=0)

@@ -43,7 +43,7 @@ def _pass(records: PathRecords, bounces: list[int], samples: np.ndarray) -> None
 def _recorded(stride: int = 1, passes: int = 1) -> tuple[PathRecords, np.ndarray, list[int]]:
     bounces = [4, 0, 2, 1, 3, 4, 0]
     samples = np.random.default_rng(3).random((4, 2, len(bounces)), dtype=np.float32)
-    records = PathRecords(lambda si, pixel, active: 100 + pixel, 3, stride, PixelEstimates(4))
+    records = PathRecords(lambda si, pixel, active: 100 + pixel, 3, stride, PixelEstimates(4, 4))
     for _ in range(passes):
         _pass(records, bounces, samples)
     records.finish()
@@ -83,7 +83,7 @@ def test_one_path_in_a_stride_is_recorded_in_each_pass() -> None:
 
 
 def test_a_stage_without_a_path_that_scatters_has_no_records() -> None:
-    records = PathRecords(lambda si, pixel, active: pixel, 2, 5, PixelEstimates(4))
+    records = PathRecords(lambda si, pixel, active: pixel, 2, 5, PixelEstimates(4, 4))
     records.begin(3, dr.arange(mi.UInt32, 3))
     records.direction(vertex_at(0), mi.Point2f(0.5), 1.0, mi.Color3f(0), mi.Bool(False))
     records.end(mi.Color3f(1))
@@ -92,7 +92,7 @@ def test_a_stage_without_a_path_that_scatters_has_no_records() -> None:
 
 
 def test_infinite_radiance_decides_nothing() -> None:
-    records = PathRecords(lambda si, pixel, active: pixel, 1, 1, PixelEstimates(4))
+    records = PathRecords(lambda si, pixel, active: pixel, 1, 1, PixelEstimates(4, 4))
     records.begin(4, dr.arange(mi.UInt32, 4))
     sample = mi.Point2f([0.1, 0.2, 0.3, 0.4], 0.5)
     records.direction(vertex_at(0), sample, 1.0, mi.Color3f(1), mi.Bool(True))
@@ -122,7 +122,7 @@ def test_records_of_a_walk_are_the_radiance_of_longer_paths() -> None:
         dr.eval(sample.L)
         return sample.L.numpy().mean(axis=0)
 
-    records = PathRecords(lambda si, pixel, active: mi.UInt32(7), bounces, 2, PixelEstimates(16))
+    records = PathRecords(lambda si, pixel, active: mi.UInt32(7), bounces, 2, PixelEstimates(16, 16))
     whole = radiance(6, records)
     records.finish()
     assert records.count == bounces * lanes // 2 and (records.region == mi.UInt32(7)).numpy().all()

@@ -78,7 +78,7 @@ def test_no_path_ends_at_mirrors_but_none_goes_on_forever() -> None:
 def test_pixels_have_the_means_of_their_neighbours() -> None:
     width, height = 24, 20
     image = np.where(np.arange(width) < 12, 1.0, 3.0)[None].repeat(height, axis=0)
-    pixels = PixelEstimates(width)
+    pixels = PixelEstimates(width, height)
     index = mi.UInt32(np.arange(width * height, dtype=np.uint32))
     for error in (-0.5, 0.5):
         pixels.add(index, mi.Float((image + error).ravel().astype(np.float32)))
@@ -90,7 +90,7 @@ def test_pixels_have_the_means_of_their_neighbours() -> None:
 
 
 def test_a_black_image_has_a_finite_scale() -> None:
-    pixels = PixelEstimates(4)
+    pixels = PixelEstimates(4, 2)
     pixels.add(mi.UInt32([0, 1, 5]), mi.Float([0.0, np.inf, np.nan]))
     assert np.isfinite(pixels.scale().numpy()).all()
 
