@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...planning.costs import SEGMENT, SHADOW, TABLE
-from ...planning.evidence import BATCHES, gain_of, trimmed_batches
+from ...planning.evidence import BATCHES, PathSums, gain_of
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...scene.lights.choice import Choice
 from ...transport.mis import power_heuristic
@@ -48,9 +48,8 @@ class ConnectionRecords(Observer):
     def restart(self) -> None:
         """Discards the records of the last pilot."""
         self.row_squares = dr.zeros(mi.Float64, self._rows)
-        self.samples, self.variance = 0, 0.0
-        self._error = self._removed = 0.0
-        self._paths = 0
+        self.samples, self.variance, self._paths = 0, 0.0, 0
+        self._sums = PathSums(others=3)
         self._batches, self._rays = np.zeros((2, BATCHES)), np.zeros(3)
 
     def kernel_state(self) -> tuple:
@@ -123,6 +122,8 @@ class ConnectionRecords(Observer):
     def finish(self) -> None:
         """Ends the observation of a stage."""
         self._collect()
+        self._batches, (error, removed, *self._rays) = self._sums.read()
+        self.variance = float(error + removed)
 
     def _collect(self) -> None:
         """Keeps what the last pass has recorded."""
@@ -130,18 +131,15 @@ class ConnectionRecords(Observer):
             return
         self._pixels.add(self._pixel, self._total)
         weight, error = self._pixels.importance(self._pixel, self._total)
+        more = self._more * weight
+        dr.eval(weight, error, more)
+        self._sums.add(error, dr.select(dr.isfinite(more), more, 0), *self._counts)
         slot = dr.arange(mi.UInt32, len(self._row))
         squares = self._square * dr.gather(mi.Float, weight, slot % self._slots)
-        squares = mi.Float64(dr.select(dr.isfinite(squares), squares, 0))
-        dr.scatter_add(self.row_squares, squares, self._row)
-        more = self._more * weight
-        more = dr.select(dr.isfinite(more), more, 0)
-        self._batches += trimmed_batches(error.numpy(), more.numpy())
-        self._rays += [float(dr.sum(mi.Float64(count))[0]) for count in self._counts]
+        is_known = (squares > 0) & dr.isfinite(squares)
+        dr.scatter_add(self.row_squares, mi.Float64(squares), self._row, is_known)
+        dr.eval(self.row_squares)
         self._paths += self._lanes
-        self._error += float(dr.sum(mi.Float64(error))[0])
-        self._removed += float(dr.sum(mi.Float64(more))[0])
-        self.variance = self._error + self._removed
         self._lanes = 0
         self._row = self._square = self._more = self._total = self._pixel = self._counts = None
 

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning.evidence import BATCHES, TRIM, gain_of, trimmed_batches
+from mitsuba_ext.planning.evidence import (
+    BATCHES,
+    TRIM,
+    PathSums,
+    gain_of,
+    trimmed_batches,
+)
 from mitsuba_ext.planning.verdicts import is_worth
 
 
@@ -53,3 +61,26 @@ def test_one_path_of_a_small_pass_is_left_out() -> None:
     expected = gain_of(trimmed_batches(error, more))[0]
     error[3] = 1e9
     assert gain_of(trimmed_batches(error, more))[0] == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("count", [1, 700, TRIM, 5 * TRIM + 77])
+def test_sums_on_the_device_leave_out_the_same_paths(count: int) -> None:
+    """Also where one path is 10⁹ times as bright as the others."""
+    sums, expected, total, rng = PathSums(1), 0.0, 0.0, np.random.default_rng(count)
+    for seed in range(2):
+        error, more = (x.astype(np.float32) for x in _paths(seed, count))
+        error[rng.integers(count)], other = 1e9, rng.random(count).astype(np.float32)
+        expected += trimmed_batches(error.astype(np.float64), more.astype(np.float64))
+        total += np.array([x.sum(dtype=np.float64) for x in (error, more, other)])
+        sums.add(*(mi.Float(x) for x in (error, more, other)))
+    batches, found = sums.read()
+    np.testing.assert_allclose(batches, expected, rtol=1e-12)
+    np.testing.assert_allclose(found, total, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("variant")
+def test_few_of_many_equal_paths_are_left_out() -> None:
+    sums, ones = PathSums(0), dr.full(mi.Float, 1, 4 * TRIM)
+    sums.add(ones, ones)
+    assert sums.read()[0].sum(axis=1) == pytest.approx(4 * TRIM - 4)

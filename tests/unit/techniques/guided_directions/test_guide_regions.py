@@ -122,7 +122,8 @@ def test_records_of_a_walk_are_the_radiance_of_longer_paths() -> None:
         dr.eval(sample.L)
         return sample.L.numpy().mean(axis=0)
 
-    records = PathRecords(lambda si, pixel, active: mi.UInt32(7), bounces, 2, PixelEstimates(16, 16))
+    pixels = PixelEstimates(16, 16)
+    records = PathRecords(lambda si, pixel, active: mi.UInt32(7), bounces, 2, pixels)
     whole = radiance(6, records)
     records.finish()
     assert records.count == bounces * lanes // 2 and (records.region == mi.UInt32(7)).numpy().all()
