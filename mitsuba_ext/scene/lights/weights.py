@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...util.arrays import from_numpy
+from ...util.arrays import from_numpy, joined
 from ...util.spectra import brightness, comparison_wavelengths
 from ..regions.surface_voxels import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
@@ -187,5 +187,8 @@ def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.
     fallback = dr.select(typical > 0, typical, 1)
     weights = dr.select(mean > 0, dr.maximum(weights, _FLOOR * mean), fallback)
     weights = dr.select(factor > 0, weights, 0)
-    last = weights.numpy().reshape(-1, count).mean(axis=0, dtype=np.float64)
-    return dr.concat([weights, mi.Float(last)])
+    rows = dr.opaque(mi.UInt32, len(weights) // count)
+    index = dr.arange(mi.UInt32, len(weights))
+    of_cell = mi.Float64(dr.gather(mi.Float, weights, index % rows * count + index // rows))
+    last = dr.block_sum(of_cell, len(weights) // count) / mi.Float64(rows)
+    return joined([weights, mi.Float(last)])

@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...util.arrays import from_numpy
+from ...util.arrays import from_numpy, joined
+from ...util.discrete_sampling import ONE_MINUS_EPSILON
 
 #: The number of sides: the positive and the negative direction of each axis.
 SIDES = 6
@@ -93,10 +94,17 @@ def _side(n: mi.Normal3f) -> mi.UInt32:
 def region(p: mi.Point3f) -> mi.ScalarBoundingBox3f:
     """A box that holds nearly all points. A few distant ones are left out because they would make
     the voxels of the box coarse."""
-    points = p.numpy()
-    low, high = np.quantile(points, [_MAX_OUTSIDE, 1 - _MAX_OUTSIDE], axis=1)
+    count = dr.width(p)
+    in_order = dr.sort(mi.TensorXf(joined([p.x, p.y, p.z]), (3, count))).array
+    place = np.array([_MAX_OUTSIDE, 1 - _MAX_OUTSIDE]) * (count - 1)
+    below = place.astype(int)
+    # The extremes of each axis, and the neighbours of both quantiles
+    chosen = np.array([0, count - 1, *below, *np.minimum(below + 1, count - 1)])
+    index = from_numpy(mi.UInt32, np.arange(3)[:, None] * count + chosen)
+    found = dr.gather(mi.Float, in_order, index).numpy().reshape(3, 3, 2).astype(np.float64)
+    low, high = (found[:, 1] + (found[:, 2] - found[:, 1]) * (place - below)).T
     # A flat region needs some depth, and distant coordinates are rounded
-    size = max((high - low).max(), 1e-4 * np.abs(points).max(), 1e-30)
+    size = max((high - low).max(), 1e-4 * np.abs(found[:, 0]).max(), 1e-30)
     margin = _MARGIN * (high - low) + 1e-3 * size
     return mi.ScalarBoundingBox3f(low - margin, high + margin)
 
@@ -132,22 +140,22 @@ class SurfaceRows:
         scale = 1 / voxel_edges(bbox, resolution)
         # Opaque so that other scenes and sensors share the kernels
         self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, dr.opaque(mi.Int32, resolution))
-        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
-        pair_count = resolution**3 * SIDES
-        pair = np.where(inside, pair, pair_count)
-        # Vertices outside come last, and are left out
-        order = np.argsort(pair, kind="stable")[: int(inside.sum())]
-        order = from_numpy(mi.UInt32, order)
+        pair, inside = self._pairs.number(p, n, mi.Bool(True))
+        dr.eval(pair, inside)
+        order = dr.compress(inside)
+        order = dr.gather(mi.UInt32, order, dr.argsort(dr.gather(mi.UInt32, pair, order)))
         self.p, self.n = dr.gather(mi.Point3f, p, order), dr.gather(mi.Normal3f, n, order)
-        pairs, first, size = np.unique(pair[order], return_index=True, return_counts=True)
-        self.pairs, self.first, self.size = (
-            from_numpy(mi.UInt32, x) for x in (pairs, first, size)
-        )
-        self.count = len(pairs) + 1
+        pair_count = resolution**3 * SIDES
+        size = _counts(pair, pair_count, inside)
+        self.pairs = dr.compress(size > 0)
+        self.size = dr.gather(mi.UInt32, size, self.pairs)
+        self.first = dr.prefix_sum(self.size)
+        self.count = len(self.pairs) + 1
         self._row = dr.full(mi.UInt32, self.count - 1, pair_count)
         dr.scatter(self._row, dr.arange(mi.UInt32, self.count - 1), self.pairs)
         self._last = dr.opaque(mi.UInt32, self.count - 1)
         dr.eval(self.p, self.n, self._row)
+        self._coarse: tuple[mi.UInt32, int] | None = None
 
     def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The row of a surface point on the side from which it is seen."""
@@ -155,14 +163,20 @@ class SurfaceRows:
         return dr.select(inside, dr.gather(mi.UInt32, self._row, pair, inside), self._last)
 
     def coarse(self) -> tuple[mi.UInt32, int]:
-        """For each row except the last, the index of the row of a grid with half the resolution
-        that contains it; and the number of such coarse rows."""
-        half = (self.resolution + 1) // 2
-        x, y, z = voxel_coordinates(self.pairs // SIDES, self.resolution)
-        voxel = voxel_number(x // 2, y // 2, z // 2, half)
-        pairs = (voxel * SIDES + self.pairs % SIDES).numpy()
-        numbers, index = np.unique(pairs, return_inverse=True)
-        return from_numpy(mi.UInt32, index), len(numbers)
+        """For each row, the index of the row of a grid with half the resolution that contains it;
+        and the number of such coarse rows. The last row is a coarse row of its own."""
+        if self._coarse is None:
+            half = (self.resolution + 1) // 2
+            x, y, z = voxel_coordinates(self.pairs // SIDES, dr.opaque(mi.UInt32, self.resolution))
+            voxel = voxel_number(x // 2, y // 2, z // 2, dr.opaque(mi.UInt32, half))
+            pairs = voxel * SIDES + self.pairs % SIDES
+            found = dr.compress(_counts(pairs, half**3 * SIDES) > 0)
+            number = dr.empty(mi.UInt32, half**3 * SIDES)
+            dr.scatter(number, dr.arange(mi.UInt32, len(found)), found)
+            last = dr.opaque(mi.UInt32, len(found))
+            index = joined([dr.gather(mi.UInt32, number, pairs), last])
+            self._coarse = index, len(found) + 1
+        return self._coarse
 
 
 def voxel_edges(bbox: mi.ScalarBoundingBox3f, resolution: int) -> mi.Vector3f:
@@ -178,10 +192,22 @@ class RowCounts:
     """
 
     def __init__(self, bbox: mi.ScalarBoundingBox3f, p: mi.Point3f, n: mi.Normal3f) -> None:
-        low, high = np.array(bbox.min), np.array(bbox.max)
-        self._relative = np.clip((p.numpy().T - low) / (high - low), 0, 1 - 1e-7)
-        self._side = sides(n.numpy().T)
+        low, high = mi.Point3f(bbox.min), mi.Point3f(bbox.max)
+        dr.make_opaque(low, high)
+        self._relative = dr.clip((p - low) / (high - low), 0, ONE_MINUS_EPSILON)
+        self._side = _side(n)
+        dr.eval(self._relative, self._side)
 
     def __call__(self, resolution: int) -> int:
-        x, y, z = (self._relative * resolution).astype(np.int64).T
-        return len(np.unique(voxel_number(x, y, z, resolution) * SIDES + self._side)) + 1
+        scale = dr.opaque(mi.UInt32, resolution)
+        cell = mi.Vector3u(self._relative * mi.Float(scale))
+        pair = voxel_number(cell.x, cell.y, cell.z, scale) * SIDES + self._side
+        return int(dr.count(_counts(pair, resolution**3 * SIDES) > 0)[0]) + 1
+
+
+def _counts(index: mi.UInt32, size: int, active: mi.Bool | bool = True) -> mi.UInt32:
+    """How often each number below ``size`` occurs."""
+    counts = dr.zeros(mi.UInt32, size)
+    # In place: copies for each thread would make the kernel depend on the size
+    dr.scatter_add(counts, mi.UInt32(1), index, active, dr.ReduceMode.Direct)
+    return counts

@@ -150,9 +150,11 @@ class LightMapLearner(Learner):
 
         def fits(grid: int) -> bool:
             # A coarser grid has no more cells
+            memory = grid**3 * BYTES_PER_VOXEL
+            if memory > self.max_memory:
+                return False
             entries = counts(grid) * cells.count
-            memory = entries * BYTES_PER_ENTRY + grid**3 * BYTES_PER_VOXEL
-            return entries <= limit and memory <= self.max_memory
+            return entries <= limit and memory + entries * BYTES_PER_ENTRY <= self.max_memory
 
         while grid > 1 and not fits(grid):
             grid = max(1, int(0.8 * grid))

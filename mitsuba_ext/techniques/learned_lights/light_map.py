@@ -144,15 +144,14 @@ class LightMap(Observer):
         entry = dr.arange(mi.UInt32, self.rows.count * count)
         row = entry // count
         cell = entry - row * count
-        tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
+        tests, successes = (
+            mi.Float64(dr.sum(mi.UInt64(n))) for n in (self.tests, self.successes)
+        )
         # Half a success in one more test keeps the prior from being 0 or 1
-        overall = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
-        expected = self._shrunk(cell, count, overall)
+        expected = self._shrunk(cell, count, mi.Float((successes + 0.5) / (tests + 1)))
         near, near_count = self.rows.coarse()
-        # The last row has no surroundings
-        near = dr.concat([near, dr.full(mi.UInt32, near_count, 1)])
         group = dr.gather(mi.UInt32, near, row) * count + cell
-        expected = self._shrunk(group, (near_count + 1) * count, expected)
+        expected = self._shrunk(group, near_count * count, expected)
         return (mi.Float(self.successes) + _PRIOR_TESTS * expected) / (
             mi.Float(self.tests) + _PRIOR_TESTS
         )
@@ -183,8 +182,8 @@ class LightMap(Observer):
         count, successes = self.cells.count, mi.UInt64(self.successes)
         cell = dr.arange(mi.UInt32, len(self.squares)) % count
         # The mean square of the shadow rays that arrived, and of one more on a dark surface
-        total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
-        arrived = dr.opaque(mi.Float, total / (int(dr.sum(successes)[0]) + 1))
+        total = mi.Float64(dr.sum(self.squares)) / _UNIT + _DARK**2
+        arrived = mi.Float(total / (mi.Float64(dr.sum(successes)) + 1))
         # The same for each cell; sums of integers do not depend on their order
         of_cell, number = dr.zeros(mi.UInt64, count), dr.zeros(mi.UInt64, count)
         dr.scatter_add(of_cell, self.squares, cell)
