@@ -132,7 +132,7 @@ def cell_means(
 ) -> mi.Float | mi.Float64:
     """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape [rows
     · cells]. If the budget does not allow the maximum number of samples for all cells, the cells
-    above the mean of their row are measured again with more samples.
+    above the mean of their row are measured again, where it allows at least twice as many for them.
 
     Parameters:
         bounds: The minimum and the maximum number of samples of a cell in a row.
@@ -145,7 +145,7 @@ def cell_means(
         row_mean = dr.repeat(dr.block_sum(means, cells), cells) / cells
         important = dr.compress(means > row_mean)
         more = _sample_count(len(important), bounds, evaluations)
-        if len(important) > 0 and more > samples:
+        if len(important) > 0 and more >= 2 * samples:
             dr.scatter(means, _means_of(important, cells, more, measure), important)
     return means
 

@@ -33,7 +33,8 @@ class ConnectionRecords(Observer):
     Attributes:
         samples (int): Paths of the last pilot, those that are not recorded included.
         row_squares (mi.Float64): For each row, the sum of the squared contributions that its
-            connections would make with Mitsuba's choice, weighted by pixel; shape [rows].
+            connections would make with Mitsuba's choice, weighted by pixel; shape [rows]. ``None``
+            after :meth:`restart`: only the first pilot predicts from them.
         variance (float): Sum of the squared errors that the paths would have with Mitsuba's choice,
             weighted by pixel.
     """
@@ -41,13 +42,14 @@ class ConnectionRecords(Observer):
     def __init__(
         self, scene: mi.Scene, pixels: PixelEstimates, rows: int, as_path: mi.Float
     ) -> None:
-        self._scene, self._pixels, self._as_path, self._rows = scene, pixels, as_path, rows
+        self._scene, self._pixels, self._as_path = scene, pixels, as_path
         self._lanes = 0
         self.restart()
+        self.row_squares = dr.zeros(mi.Float64, rows)
 
     def restart(self) -> None:
         """Discards the records of the last pilot."""
-        self.row_squares = dr.zeros(mi.Float64, self._rows)
+        self.row_squares = None
         self.samples, self.variance, self._paths = 0, 0.0, 0
         self._sums = PathSums(others=3)
         self._batches, self._rays = np.zeros((2, BATCHES)), np.zeros(3)
@@ -132,16 +134,21 @@ class ConnectionRecords(Observer):
         self._pixels.add(self._pixel, self._total)
         weight, error = self._pixels.importance(self._pixel, self._total)
         more = self._more * weight
+        more = dr.select(dr.isfinite(more), more, 0)
         dr.eval(weight, error, more)
-        self._sums.add(error, dr.select(dr.isfinite(more), more, 0), *self._counts)
+        self._sums.add(error, more, *self._counts)
+        if self.row_squares is not None:
+            self._add_squares(weight)
+        self._paths += self._lanes
+        self._lanes = 0
+        self._row = self._square = self._more = self._total = self._pixel = self._counts = None
+
+    def _add_squares(self, weight: mi.Float) -> None:
         slot = dr.arange(mi.UInt32, len(self._row))
         squares = self._square * dr.gather(mi.Float, weight, slot % self._slots)
         is_known = (squares > 0) & dr.isfinite(squares)
         dr.scatter_add(self.row_squares, mi.Float64(squares), self._row, is_known)
         dr.eval(self.row_squares)
-        self._paths += self._lanes
-        self._lanes = 0
-        self._row = self._square = self._more = self._total = self._pixel = self._counts = None
 
     @property
     def measured(self) -> tuple[float, float]:

@@ -158,10 +158,10 @@ class LightMap(Observer):
 
     def _shrunk(self, group: mi.UInt32, group_count: int, expected: mi.Float) -> mi.Float:
         """For each entry, the success rate of its group, with ``expected`` as the prior."""
-        tests, successes = (dr.zeros(mi.UInt32, group_count) for _ in range(2))
-        dr.scatter_add(tests, self.tests, group)
-        dr.scatter_add(successes, self.successes, group)
-        tests, successes = (mi.Float(dr.gather(mi.UInt32, n, group)) for n in (tests, successes))
+        sums = dr.zeros(mi.UInt64, group_count)
+        dr.scatter_add(sums, self._counts, group)
+        counts = dr.gather(mi.UInt64, sums, group)
+        tests, successes = mi.Float(counts & 0xFFFFFFFF), mi.Float(counts >> 32)
         return (successes + _PRIOR_TESTS * expected) / (tests + _PRIOR_TESTS)
 
     def weights(self, target: str) -> mi.Float:
