@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,8 @@ class CoarseFilm:
             film = cls.whole(width, height)
             return cls(width, height, pixels, None, np.tile(film.samples, -(-count // pixels)))
         columns, rows = (max(1, round(scale * size)) for size in (width, height))
-        column, row = _places(width, columns), _places(height, rows)
+        column = place(np.arange(width), width, columns)
+        row = place(np.arange(height), height, rows)
         of_pixel = (row[:, None] * columns + column).ravel().astype(np.uint32)
         x, y = _centres(width, columns), _centres(height, rows)
         samples = (y[:, None] * width + x).ravel().astype(np.uint32)
@@ -50,8 +52,10 @@ class CoarseFilm:
         return float(np.sqrt(self.pixel_count / (self.width * self.height)))
 
 
-def _places(size: int, parts: int) -> np.ndarray:
-    return (2 * np.arange(size) + 1) * parts // (2 * size)
+def place(index: Any, size: Any, parts: Any) -> Any:
+    """The part of a row or column to which its pixel ``index`` belongs. Arguments are integers, or
+    arrays of NumPy or Dr.Jit."""
+    return (2 * index + 1) * parts // (2 * size)
 
 
 def _centres(size: int, parts: int) -> np.ndarray:

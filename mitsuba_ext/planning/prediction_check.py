@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..images.coarse_film import CoarseFilm
+from ..images.coarse_film import CoarseFilm, place
 from ..rendering.camera import film_extent, first_pixel
 from ..rendering.pass_images import PassImages
+from ..util.arrays import joined
 from .evidence import gain_of, trimmed_batches
 from .pixel_estimates import relative_scale
 
@@ -56,11 +58,10 @@ class PredictionCheck:
         """
         if self.images.count < 2:
             return False
-        variance = np.maximum(self._on_coarse_film(self.images.variance()), self._least)
-        weight = self._weight
+        variance, mean = self._on_coarse_film(self.images.variance(), self.images.mean())
+        variance, weight = np.maximum(variance, self._least), self._weight
         if weight is None:
-            mean = self._on_coarse_film(self.images.mean()).reshape(self._coarse.height, -1)
-            weight = relative_scale(mean, 1).ravel() ** 2
+            weight = relative_scale(mean.reshape(self._coarse.height, -1), 1).ravel() ** 2
         # Pixels are left out where either is largest
         sums = trimmed_batches(variance * weight, (self._of_rival - variance) * weight)
         gain, self.error = gain_of(sums)
@@ -68,14 +69,24 @@ class PredictionCheck:
         efficiency = 1 / (max(self.variance, 1e-6) * time)
         return bool(efficiency * np.exp(self.error) < rival)
 
-    def _on_coarse_film(self, image: np.ndarray) -> np.ndarray:
-        """The means of an image of the crop window over the rectangles of the coarse film."""
-        height, width = image.shape
-        place = np.arange(self._coarse.pixel_count)
-        if self._coarse.of_pixel is not None:
-            place = self._coarse.of_pixel
-        x, y = np.subtract(self._film.crop_offset(), first_pixel(self._film))
-        place = place.reshape(-1, film_extent(self._film)[0])[y : y + height, x : x + width].ravel()
-        count = self._coarse.width * self._coarse.height
-        sums = np.bincount(place, image.ravel(), count)
-        return sums / np.maximum(np.bincount(place, minlength=count), 1)
+    def _on_coarse_film(self, *images: mi.Float64) -> np.ndarray:
+        """The means of images of the crop window over the rectangles of the coarse film, shape
+        [images, rectangles]."""
+        width = dr.opaque(mi.UInt32, int(self._film.crop_size().x))
+        index = dr.arange(mi.UInt32, dr.width(images))
+        cell = [index % width, index // width]
+        corner = np.subtract(self._film.crop_offset(), first_pixel(self._film))
+        parts = self._coarse.width, self._coarse.height
+        for axis, size in enumerate(film_extent(self._film)):
+            first, size, count = (
+                dr.opaque(mi.UInt32, int(x)) for x in (corner[axis], size, parts[axis])
+            )
+            cell[axis] = place(cell[axis] + first, size, count)
+        rectangle = cell[1] * dr.opaque(mi.UInt32, parts[0]) + cell[0]
+        # In double precision: the order of the pixels changes digits that decide nothing
+        sums = [dr.zeros(mi.Float64, parts[0] * parts[1]) for _ in range(len(images) + 1)]
+        for total, image in zip(sums, (*images, mi.Float64(1))):
+            dr.scatter_add(total, image, rectangle, mode=dr.ReduceMode.Direct)
+        *sums, count = sums
+        means = joined([mi.Float(x / dr.maximum(count, 1)) for x in sums])
+        return means.numpy().reshape(len(sums), -1).astype(np.float64)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..util.arrays import from_numpy
+
 #: Intervals of the table of a filter's integral.
-_TABLE = 1 << 14
+_TABLE = 1 << 12
 
 
 def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp: int) -> None:
@@ -18,9 +21,12 @@ def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp
     """
     if not film.rfilter().is_box_filter():
         channel = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
-        weights = np.array(film.develop(raw=True))[..., channel]
-        ratio = weights / (spp * mean_weights(film))
-        splats = splats * mi.TensorXf(ratio[..., None].astype(np.float32))
+        sums = dr.detach(film.develop(raw=True))
+        height, width, count = sums.shape
+        pixel = dr.arange(mi.UInt32, height * width)
+        weights = mi.Float64(dr.gather(mi.Float, sums.array, pixel * count + channel))
+        ratio = weights / (dr.opaque(mi.Float64, spp) * expected_weights(film))
+        splats = splats * mi.TensorXf(mi.Float(ratio), (height, width, 1))
     film.put_block(mi.ImageBlock(splats, offset=offset))
 
 
@@ -28,6 +34,21 @@ def mean_weights(film: mi.Film) -> np.ndarray:
     """The mean of the filter weights that one camera sample in each pixel adds to each pixel:
     [height, width]. Pixels at the edges get less, because there are no samples outside of the
     film."""
+    rows, columns = _mean_weights(film)
+    return rows[:, None] * columns
+
+
+def expected_weights(film: mi.Film) -> mi.Float64:
+    """:func:`mean_weights` on the device, row by row."""
+    rows, columns = (from_numpy(mi.Float64, x) for x in _mean_weights(film))
+    index = dr.arange(mi.UInt32, len(rows) * len(columns))
+    width = dr.opaque(mi.UInt32, len(columns))
+    y = index // width
+    return dr.gather(mi.Float64, rows, y) * dr.gather(mi.Float64, columns, index - y * width)
+
+
+def _mean_weights(film: mi.Film) -> tuple[np.ndarray, np.ndarray]:
+    """The factors of :func:`mean_weights` of each row and of each column."""
     edges, values = _table(film.rfilter())
     integral = np.concatenate([[0], np.cumsum(values)]) * (edges[1] - edges[0])
 
@@ -36,7 +57,7 @@ def mean_weights(film: mi.Film) -> np.ndarray:
         return np.interp(size - centre, edges, integral) - np.interp(-centre, edges, integral)
 
     width, height = film.crop_size()
-    return along(height)[:, None] * along(width)
+    return along(height), along(width)
 
 
 def share_of_squares(film: mi.Film) -> float:

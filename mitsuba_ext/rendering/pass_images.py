@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from .filter_weights import mean_weights, share_of_squares, shares_of_pixels
+from .filter_weights import expected_weights, share_of_squares, shares_of_pixels
 
 #: The fewest passes of a stage whose images are wanted. A variance needs two images.
 FEWEST_PASSES = 3
@@ -19,68 +19,97 @@ class PassImages:
 
     Parameters:
         film: The film. Special ones, which hold no colours, have no images.
+
+    Attributes:
+        count: The number of images.
     """
 
     def __init__(self, film: mi.Film) -> None:
-        self._film = film
+        self._film, self.count = film, 0
         self._is_special = mi.has_flag(film.flags(), mi.FilmFlags.Special)
-        self._before: tuple[np.ndarray, np.ndarray, int] | None = None
-        self._images: list[np.ndarray] = []
-        self._spp: list[int] = []
-
-    @property
-    def count(self) -> int:
-        """The number of images."""
-        return len(self._images)
+        self._before: tuple[mi.Float64, mi.Float64, mi.Float64] | None = None
+        self._weights: mi.Float64 | None = None
+        self._spp_before = self._spp = 0
+        self._mean, self._squares = mi.Float64(0), mi.Float64(0)
 
     def begin(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
         """Called before the first pass of a stage, with the sums of all samples until then, and
         their number for each pixel."""
-        if self._is_special:
-            return
-        sums = _contents(block)
-        splatted = np.zeros_like(sums) if splats is None else _contents(splats)
-        self._before = sums, splatted, spp
+        if not self._is_special:
+            self._before, self._spp_before = self._sums(block, splats), spp
 
     def add(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
         """Called after each pass, as :meth:`begin`."""
         if self._is_special:
             return
-        before, splatted_before, spp_before = self._before
-        self.begin(block, splats, spp)
-        sums, splatted, _ = self._before
-        image = self._image(sums - before, splatted - splatted_before, spp - spp_before)
-        self._images.append(np.where(np.isfinite(image), image, 0))
-        self._spp.append(spp - spp_before)
+        now = self._sums(block, splats)
+        colour, weight, splatted = (x - y for x, y in zip(now, self._before))
+        own, self._before, self._spp_before = spp - self._spp_before, now, spp
+        image = colour / dr.select(weight == 0, 1, weight)
+        if self._weights is None:
+            self._weights = expected_weights(self._film)
+        image += splatted / (dr.opaque(mi.Float64, own) * self._weights)
+        image = dr.select(dr.isfinite(image), image, 0)
+        # Welford's update, weighted by the samples of the pass
+        self.count, self._spp = self.count + 1, self._spp + own
+        deviation = image - self._mean
+        self._mean += deviation * dr.opaque(mi.Float64, own / self._spp)
+        self._squares += dr.opaque(mi.Float64, own) * deviation * (image - self._mean)
+        dr.eval(self._mean, self._squares, self._weights)
 
-    def _image(self, sums: np.ndarray, splatted: np.ndarray, spp: int) -> np.ndarray:
-        weight = sums[..., 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3]
-        colour = sums[..., :3].mean(axis=2) / np.where(weight == 0, 1, weight)
-        return colour + splatted[..., :3].mean(axis=2) / (spp * mean_weights(self._film))
+    def _sums(
+        self, block: mi.ImageBlock, splats: mi.ImageBlock | None
+    ) -> tuple[mi.Float64, mi.Float64, mi.Float64]:
+        """For each pixel, row by row: the sums of colours, of filter weights, and of splats."""
+        alpha = 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3
+        sums = (
+            _colour(block), mi.Float64(_channel(block, alpha)),
+            mi.Float64(0) if splats is None else _colour(splats),
+        )  # fmt: skip
+        dr.eval(sums)
+        return sums
 
-    def mean(self) -> np.ndarray:
-        """The radiance of each pixel, [y, x]."""
-        return np.average(self._images, axis=0, weights=self._spp)
+    def mean(self) -> mi.Float64:
+        """The radiance of each pixel, row by row."""
+        return self._mean
 
-    def variance(self) -> np.ndarray:
-        """An estimate of the variance of one sample of each pixel, [y, x], from two images or more.
+    def variance(self) -> mi.Float64:
+        """An estimate of the variance of one sample of each pixel, row by row, from two images or
+        more.
 
         A filter that is wider than a pixel averages the samples of several pixels. Their variances
         are assumed to be about equal. The contrast between them is noise of the film, too, but not
         of the samples of a pixel: it is taken from the mean."""
-        spp, mean = np.array(self._spp)[:, None, None], self.mean()
-        squares = (spp * (np.array(self._images) - mean) ** 2).sum(axis=0) / (self.count - 1)
-        return np.maximum(squares / share_of_squares(self._film) - self._contrast(mean), 0)
+        share = (self.count - 1) * share_of_squares(self._film)
+        variance = self._squares / dr.opaque(mi.Float64, share)
+        return dr.maximum(variance - self._contrast(), 0)
 
-    def _contrast(self, mean: np.ndarray) -> np.ndarray:
+    def _contrast(self) -> mi.Float64:
         """The mean squared difference of each pixel to those around, weighted as by the squared
         filter."""
         shares = shares_of_pixels(self._film)
-        radius = len(shares) // 2
-        padded = np.pad(mean, radius, mode="edge")
-        around = np.lib.stride_tricks.sliding_window_view(padded, shares.shape)
-        return (shares * (around - mean[..., None, None]) ** 2).sum(axis=(2, 3))
+        radius, size = len(shares) // 2, self._film.crop_size()
+        width, height = (dr.opaque(mi.Int32, int(x)) for x in size)
+        index = dr.arange(mi.Int32, len(self._mean))
+        y = index // width
+        x, result = index - y * width, mi.Float64(0)
+        for row, of_row in enumerate(shares):
+            for column, share in enumerate(of_row):
+                # Pixels outside are like those at the edge
+                near_x = dr.clip(x + (column - radius), 0, width - 1)
+                near_y = dr.clip(y + (row - radius), 0, height - 1)
+                near = dr.gather(mi.Float64, self._mean, mi.UInt32(near_y * width + near_x))
+                result += float(share) * dr.square(near - self._mean)
+        return result
 
 
-def _contents(block: mi.ImageBlock) -> np.ndarray:
-    return np.array(block.tensor(), dtype=np.float64)
+def _channel(block: mi.ImageBlock, channel: int) -> mi.Float:
+    values = dr.detach(block.tensor().array)
+    count = block.channel_count()
+    pixel = dr.arange(mi.UInt32, len(values) // count)
+    return dr.gather(mi.Float, values, pixel * count + channel)
+
+
+def _colour(block: mi.ImageBlock) -> mi.Float64:
+    """The mean of the three channels of colour."""
+    return sum(mi.Float64(_channel(block, channel)) for channel in range(3)) * (1 / 3)
