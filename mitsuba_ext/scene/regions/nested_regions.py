@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...util.arrays import from_numpy
+from ...util.arrays import from_numpy, joined
 from ...util.stored_arrays import StoredArrays
-from .surface_voxels import SIDES, VoxelSides, region, voxel_coordinates
+from .surface_voxels import SIDES, VoxelSides, counts_below, region, voxel_coordinates
 
 #: The number of voxels along each axis at each level; they divide the previous level's voxels.
 _GRIDS = (4, 8, 16, 32)
@@ -42,15 +42,20 @@ class NestedRegions:
         scale = finest / mi.Vector3f(bbox.max - bbox.min)
         self._origin, self._scale = np.array(bbox.min), np.array(scale).ravel()
         self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, finest)
-        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
-        voxel, side = np.divmod(pair[inside], SIDES)
+        points = counts_below(finest**3 * SIDES, *self._pairs.number(p, n, mi.Bool(True)))
+        pair = dr.compress(points > 0)
+        points = dr.gather(mi.UInt32, points, pair)
+        # Of the points, only these numbers are copied to the host
+        pair, points = joined([pair, points]).numpy().reshape(2, -1)
+        voxel, side = np.divmod(pair, SIDES)
         cell = np.stack(voxel_coordinates(voxel, finest))
 
         divisions = []
         for grid in _GRIDS:
             x, y, z = cell * grid // finest
             place = np.ravel_multi_index((z, y, x, side), (grid, grid, grid, SIDES))
-            divisions.append(np.unique(place, return_counts=True))
+            seen, which = np.unique(place, return_inverse=True)
+            divisions.append((seen, np.bincount(which, points, len(seen))))
         times = np.sort(np.concatenate([times for _seen, times in divisions]))
         if len(times) >= most:
             least = max(least, times[len(times) - most] + 1)

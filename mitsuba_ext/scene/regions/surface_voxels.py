@@ -146,7 +146,7 @@ class SurfaceRows:
         order = dr.gather(mi.UInt32, order, dr.argsort(dr.gather(mi.UInt32, pair, order)))
         self.p, self.n = dr.gather(mi.Point3f, p, order), dr.gather(mi.Normal3f, n, order)
         pair_count = resolution**3 * SIDES
-        size = _counts(pair, pair_count, inside)
+        size = counts_below(pair_count, pair, inside)
         self.pairs = dr.compress(size > 0)
         self.size = dr.gather(mi.UInt32, size, self.pairs)
         self.first = dr.prefix_sum(self.size)
@@ -170,7 +170,7 @@ class SurfaceRows:
             x, y, z = voxel_coordinates(self.pairs // SIDES, dr.opaque(mi.UInt32, self.resolution))
             voxel = voxel_number(x // 2, y // 2, z // 2, dr.opaque(mi.UInt32, half))
             pairs = voxel * SIDES + self.pairs % SIDES
-            found = dr.compress(_counts(pairs, half**3 * SIDES) > 0)
+            found = dr.compress(counts_below(half**3 * SIDES, pairs) > 0)
             number = dr.empty(mi.UInt32, half**3 * SIDES)
             dr.scatter(number, dr.arange(mi.UInt32, len(found)), found)
             last = dr.opaque(mi.UInt32, len(found))
@@ -202,10 +202,10 @@ class RowCounts:
         scale = dr.opaque(mi.UInt32, resolution)
         cell = mi.Vector3u(self._relative * mi.Float(scale))
         pair = voxel_number(cell.x, cell.y, cell.z, scale) * SIDES + self._side
-        return int(dr.count(_counts(pair, resolution**3 * SIDES) > 0)[0]) + 1
+        return int(dr.count(counts_below(resolution**3 * SIDES, pair) > 0)[0]) + 1
 
 
-def _counts(index: mi.UInt32, size: int, active: mi.Bool | bool = True) -> mi.UInt32:
+def counts_below(size: int, index: mi.UInt32, active: mi.Bool | bool = True) -> mi.UInt32:
     """How often each number below ``size`` occurs."""
     counts = dr.zeros(mi.UInt32, size)
     # In place: copies for each thread would make the kernel depend on the size
