@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..util.arrays import channel_mean, from_numpy
+from ..util.arrays import channel_mean
+from ..util.discrete_sampling import first_above
 from . import camera
 from .pixel_moments import PixelMoments
 from .render import Job
@@ -76,8 +76,8 @@ class AdaptiveJob(Job):
         if self._rest_of_first > 0:
             super()._run_stage(stage, self._rest_of_first, False, interrupt)
         total = self.plan.spp * self.plan.pixel_count
-        while self.allocation.is_active.any() and not self._stopped(interrupt):
-            left = total - int(self.moments.count.sum())
+        while self.allocation.has_active and not self._stopped(interrupt):
+            left = total - self.moments.total
             if left <= 0:
                 break
             budget = left if (fits := self._samples_that_fit()) is None else min(left, fits)
@@ -85,12 +85,10 @@ class AdaptiveJob(Job):
             sets, weight = self.allocation.next(budget / passes, passes == 1, 1 / passes)
             self._run_sets(stage, sets, weight)
             if self.request.progress is not None:
-                is_done = passes == 1 or not self.allocation.is_active.any()
-                done = int(self.moments.count.sum())
+                is_done = passes == 1 or not self.allocation.has_active
+                done = self.moments.total
                 tell(self.request.progress, 1.0 if is_done else done / (done + left))
-        self.statistics.interrupted = self._stopped(interrupt) and bool(
-            self.allocation.is_active.any()
-        )
+        self.statistics.interrupted = self._stopped(interrupt) and self.allocation.has_active
 
     def _samples_that_fit(self) -> float | None:
         """The number of samples that fit into the time left; ``None`` if there is no limit, or the
@@ -103,23 +101,26 @@ class AdaptiveJob(Job):
         """Renders ``spp`` samples of every pixel."""
         return self._run_sets(stage, *self.allocation.first(spp))
 
-    def _run_sets(self, stage: Stage, sets: np.ndarray, weight: np.ndarray) -> bool:
+    def _run_sets(self, stage: Stage, sets: mi.UInt32, weight: mi.Float) -> bool:
         """Renders ``sets`` sets of each pixel into the block. Returns True if it compiled a
         kernel."""
         timer = PassTimer()
-        pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
-        table = from_numpy(mi.Float, weight)
-        for start in range(0, len(pixels), self._most_sets):
-            self._run_part_of_sets(stage, pixels[start : start + self._most_sets], table)
+        ends = dr.cumsum(sets)
+        dr.eval(ends)
+        count = int(ends[len(ends) - 1])
+        for start in range(0, count, self._most_sets):
+            number = dr.arange(mi.UInt32, min(self._most_sets, count - start))
+            pixels = _pixels(ends, number + dr.opaque(mi.UInt32, start))
+            self._run_part_of_sets(stage, pixels, weight)
         seconds, compiled = timer.seconds, timer.has_new_kernels
         if timer.has_compiled:
             self.statistics.compile_seconds += seconds
-        if not compiled and len(pixels):
-            self.limit.measure(len(pixels) * self._set_size / self.plan.pixel_count, seconds)
-        self.statistics.spp = round(self.moments.count.sum() / self.plan.pixel_count)
+        if not compiled and count:
+            self.limit.measure(count * self._set_size / self.plan.pixel_count, seconds)
+        self.statistics.spp = round(self.moments.total / self.plan.pixel_count)
         return compiled
 
-    def _run_part_of_sets(self, stage: Stage, pixels: np.ndarray, weight: mi.Float) -> None:
+    def _run_part_of_sets(self, stage: Stage, pixels: mi.UInt32, weight: mi.Float) -> None:
         size = len(pixels) * self._set_size
         sampler = self.sampler.clone()
         seed = self.request.seed
@@ -128,14 +129,15 @@ class AdaptiveJob(Job):
         sampler.seed(dr.opaque(mi.UInt32, seed), size)
         lane = dr.arange(mi.UInt32, size)
         in_set = lane // dr.opaque(mi.UInt32, self._set_size)
-        pixel = dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), in_set)
+        pixel = dr.gather(mi.UInt32, pixels, in_set)
         lanes = camera.lanes_at(self.film, pixel, dr.zeros(mi.UInt32, size))
         rays = self._rays(stage, sampler, lanes)
         sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
         brightness = channel_mean(sample.L * (rays.importance * rays.weight))
+        brightness += dr.zeros(mi.Float, size)  # of one lane where all samples are equal
         dr.eval(brightness, self.block.tensor(), self.tally)
         dr.sync_thread()
-        self.moments.add(pixels, np.broadcast_to(brightness.numpy(), size))
+        self.moments.add(pixels, brightness)
         self.statistics.passes += 1
         self.statistics.rays["camera"] += size
 
@@ -149,12 +151,22 @@ class AdaptiveJob(Job):
         film divides."""
         width, height = self._pixels
         tensor = self.block.tensor()
-        shape = tuple(tensor.shape)
-        top, left = ((height - shape[0]) // 2, (width - shape[1]) // 2)
-        count = self.moments.count.reshape(height, width)
-        count = count[top : top + shape[0], left : left + shape[1]]
-        values = np.array(tensor)
+        rows, columns, channels = tensor.shape
+        index = dr.arange(mi.UInt32, rows * columns)
+        y, x = index // columns + (height - rows) // 2, index % columns + (width - columns) // 2
+        count = mi.Float(dr.gather(mi.UInt32, self.moments.count, y * width + x))
         weights = 4 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 3
-        values[..., -1] = count * values[..., weights]
+        values = mi.Float(tensor.array)
+        count *= dr.gather(mi.Float, values, index * channels + weights)
+        dr.scatter(values, count, index * channels + (channels - 1))
         offset = self.block.offset()
-        self.block = mi.ImageBlock(mi.TensorXf(values), offset=offset)
+        self.block = mi.ImageBlock(mi.TensorXf(values, tensor.shape), offset=offset)
+
+
+def _pixels(ends: mi.UInt32, number: mi.UInt32) -> mi.UInt32:
+    """The pixel of each set: those of pixel i end before number ``ends[i]``."""
+    last = dr.opaque(mi.UInt32, len(ends))
+    longest = 1 << 8 * -(-len(ends).bit_length() // 8)  # few different numbers of steps
+    pixels = first_above(ends, mi.UInt32(0), last, number, mi.Bool(True), longest)
+    dr.eval(pixels)
+    return pixels

@@ -10,7 +10,8 @@ up to one, so that the weighted sum is unbiased too.
 
 from __future__ import annotations
 
-import numpy as np
+import drjit as dr
+import mitsuba as mi
 
 from .pixel_moments import PixelMoments
 
@@ -26,6 +27,9 @@ _LEAST = 1 / 8
 #: the first pass does not give noisy pixels more samples than others.
 _FIRST_WEIGHT = 1 / 2
 
+#: Fixed point of numbers of sets: their running sums are exact.
+_UNIT = 2.0**24
+
 
 class SampleAllocation:
     """Numbers and weights of the samples of a render.
@@ -38,28 +42,29 @@ class SampleAllocation:
         set_size: Number of samples of a pixel that are always taken together.
 
     Attributes:
-        is_active: Pixels that get more samples.
+        has_active: Whether there are pixels that get more samples.
     """
 
     def __init__(
         self, moments: PixelMoments, spp: int, first: int, threshold: float = 0.0, set_size: int = 1
     ) -> None:
         self._moments, self._threshold, self._set_size = moments, threshold, set_size
-        size = len(moments.count)
-        self._weight_left = np.ones(size)
+        size = moments.pixel_count
+        self._weight_left = dr.full(mi.Float64, 1, size)
         # The variance of the image so far, in units of the variance of a sample
-        self._variance = np.zeros(size)
-        self.is_active = np.ones(size, bool)
+        self._variance = dr.zeros(mi.Float64, size)
+        self._is_active, self.has_active = dr.full(mi.Bool, True, size), True
         # The weight of each sample of the first pass
         self._first_weight = _FIRST_WEIGHT / spp if first < spp else 1 / first
 
-    def first(self, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    def first(self, samples: int) -> tuple[mi.UInt32, mi.Float]:
         """For a part of the first pass that takes ``samples`` samples of every pixel: the number of
         sets of each pixel, and the weight of each of its samples."""
-        sets = np.full(len(self.is_active), -(-samples // self._set_size))
-        return sets, self._take(sets, self._first_weight * samples * np.ones(len(sets)))
+        size = self._moments.pixel_count
+        sets = dr.opaque(mi.UInt32, -(-samples // self._set_size), size)
+        return sets, self._take(sets, dr.opaque(mi.Float64, self._first_weight * samples, size))
 
-    def next(self, budget: float, is_last: bool, share: float) -> tuple[np.ndarray, np.ndarray]:
+    def next(self, budget: float, is_last: bool, share: float) -> tuple[mi.UInt32, mi.Float]:
         """For the next pass: the number of sets of each pixel, and the weight of each of its
         samples.
 
@@ -68,37 +73,46 @@ class SampleAllocation:
             is_last: Whether it is the last pass.
             share: The fraction of the remaining weight that this pass gets.
         """
-        active = self.is_active
-        deviation = self._moments.deviation()
-        wanted = np.where(active, deviation**_POWER, 0)
-        count = max(1, int(active.sum()))
-        mean = wanted.sum() / count
-        relative = wanted / mean if mean > 0 else active.astype(float)
+        active, deviation = self._is_active, self._moments.deviation()
+        wanted = dr.select(active, dr.power(deviation, _POWER), 0)
+        dr.eval(deviation, wanted)
+        count = dr.maximum(mi.Float64(dr.count(active)), 1)
+        mean = dr.sum(wanted) / count
+        relative = dr.select(mean > 0, wanted / mean, dr.select(active, mi.Float64(1), 0))
+        budget, share = dr.opaque(mi.Float64, budget), dr.opaque(mi.Float64, share)
         samples = budget / count * (_LEAST + (1 - _LEAST) * relative)
-        is_done = np.full(len(active), is_last)
+        is_done = dr.opaque(mi.Bool, is_last, len(active))
         if self._threshold > 0:
             # The samples that reach the threshold if this pass gets all the remaining weight
-            variance = deviation**2
-            left = self._threshold**2 - self._variance * variance
-            needed = self._weight_left**2 * variance / np.maximum(left, 1e-30)
+            variance = dr.square(deviation)
+            left = dr.opaque(mi.Float64, self._threshold**2) - self._variance * variance
+            needed = dr.square(self._weight_left) * variance / dr.maximum(left, 1e-30)
             is_done |= needed <= samples
-            samples = np.minimum(samples, needed)
-        sets = np.where(active, np.maximum(_whole(samples / self._set_size, active), 1), 0)
-        weight = self._weight_left * np.where(is_done, 1.0, share)
-        scale = self._take(sets, np.where(active, weight, 0))
-        self.is_active = active & ~is_done
+            samples = dr.minimum(samples, needed)
+        sets = _whole(samples / dr.opaque(mi.Float64, self._set_size), active)
+        sets = dr.select(active, dr.maximum(sets, 1), 0)
+        weight = self._weight_left * dr.select(is_done, mi.Float64(1), share)
+        scale = self._take(sets, dr.select(active, weight, 0))
+        self._is_active = active & ~is_done
+        dr.eval(sets, scale, self._is_active)
+        self.has_active = bool(dr.any(self._is_active))
         return sets, scale
 
-    def _take(self, sets: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    def _take(self, sets: mi.UInt32, weight: mi.Float64) -> mi.Float:
         """Records a pass. Returns the weight of each sample."""
-        samples = np.maximum(sets * self._set_size, 1)
-        self._weight_left = np.maximum(self._weight_left - weight, 0)
-        self._variance += weight**2 / samples
-        return weight / samples
+        samples = dr.maximum(mi.Float64(sets) * dr.opaque(mi.Float64, self._set_size), 1)
+        self._weight_left = dr.maximum(self._weight_left - weight, 0)
+        self._variance += dr.square(weight) / samples
+        scale = mi.Float(weight / samples)
+        dr.eval(self._weight_left, self._variance, scale)
+        return scale
 
 
-def _whole(values: np.ndarray, active: np.ndarray) -> np.ndarray:
+def _whole(values: mi.Float64, active: mi.Bool) -> mi.UInt32:
     """The ``values``, rounded such that their sum stays about the same: rounding errors are carried
     over to the next pixel."""
-    total = np.floor(np.cumsum(np.where(active, values, 0)) + 0.5)
-    return np.diff(total, prepend=0).astype(np.int64)
+    running = dr.cumsum(mi.UInt64(dr.select(active, values, 0) * _UNIT + 0.5))
+    total = mi.UInt64(mi.Float64(running) / _UNIT + 0.5)
+    dr.eval(total)
+    index = dr.arange(mi.UInt32, len(total))
+    return mi.UInt32(total - dr.gather(mi.UInt64, total, index - 1, index > 0))

@@ -31,7 +31,7 @@ def copied(monkeypatch) -> list[int]:
 
 @pytest.mark.usefixtures("variant")
 def test_no_copy_of_learned_lights_grows_with_the_film(copied: list[int]) -> None:
-    """An image of the larger film has 81 KiB in single precision, and no copy a twentieth of that."""
+    """An image of the larger film has 81 KiB in single precision."""
     largest, total = [], []
     for width, height in ((96, 54), (192, 108)):
         scene = mi.load_file(str(ROOT / "scenes" / "rooms.xml"), width=width, height=height)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -50,13 +51,13 @@ def _image(seed: int, threshold: float = 0.0, is_naive: bool = False, spp: int =
     total, weights = np.zeros(SIDE * SIDE), np.zeros(SIDE * SIDE)
     sets, weight = allocation.first(4)
     for left in range(7, -1, -1):
-        pixels = np.repeat(np.arange(SIDE * SIDE), sets)
+        pixels = np.repeat(np.arange(SIDE * SIDE), sets.numpy())
         values = _spiky(random, pixels)
-        moments.add(pixels, values)
-        scale = np.ones_like(values) if is_naive else weight[pixels]
+        moments.add(mi.UInt32(pixels), mi.Float(values))
+        scale = np.ones_like(values) if is_naive else weight.numpy()[pixels]
         total += np.bincount(pixels, scale * values, SIDE * SIDE)
         weights += np.bincount(pixels, scale, SIDE * SIDE)
-        if left > 0 and allocation.is_active.any():
+        if left > 0 and allocation.has_active:
             sets, weight = allocation.next(4 * SIDE * SIDE, left == 1, 1 / left)
         else:
             break
@@ -79,9 +80,10 @@ def test_mean_of_64_short_renders_is_unbiased_where_equal_weights_are_not(thresh
 def test_no_pixel_is_starved_and_the_sum_is_kept():
     moments = PixelMoments(SIDE, SIDE)
     allocation = SampleAllocation(moments, 64, 8)
-    pixels = np.repeat(np.arange(SIDE * SIDE), allocation.first(8)[0])
-    moments.add(pixels, np.where(pixels == 100, _spiky(np.random.default_rng(1), pixels), 1.0))
-    sets, _weight = allocation.next(8 * SIDE * SIDE, True, 1.0)
+    pixels = np.repeat(np.arange(SIDE * SIDE), allocation.first(8)[0].numpy())
+    values = np.where(pixels == 100, _spiky(np.random.default_rng(1), pixels), 1.0)
+    moments.add(mi.UInt32(pixels), mi.Float(values))
+    sets = allocation.next(8 * SIDE * SIDE, True, 1.0)[0].numpy().astype(int)
     assert sets.min() >= 1 and abs(sets.sum() - 8 * SIDE * SIDE) <= 1
     assert sets.argmax() == 100
 
@@ -89,15 +91,15 @@ def test_no_pixel_is_starved_and_the_sum_is_kept():
 def test_the_variance_of_sets_is_the_variance_of_their_means():
     """Stratified samples vary within a set, and less between sets."""
     moments = PixelMoments(1, 1, set_size=4)
-    moments.add(np.zeros(8, int), np.tile([0.0, 1.0, 2.0, 3.0], 8))
-    assert moments.deviation()[0] == 0 and moments.count[0] == 32
+    moments.add(dr.zeros(mi.UInt32, 8), mi.Float(np.tile([0.0, 1.0, 2.0, 3.0], 8)))
+    assert moments.deviation()[0] == 0 and moments.count[0] == moments.total == 32
 
 
 def test_a_black_image_gets_equal_samples():
     moments = PixelMoments(4, 4)
     allocation = SampleAllocation(moments, 64, 8)
-    moments.add(np.repeat(np.arange(16), 8), np.full(128, np.nan))
-    assert (allocation.next(160, True, 1.0)[0] == 10).all()
+    moments.add(mi.UInt32(np.repeat(np.arange(16), 8)), dr.full(mi.Float, np.nan, 128))
+    assert (allocation.next(160, True, 1.0)[0].numpy() == 10).all()
 
 
 # ---- Renders ----
@@ -118,7 +120,7 @@ def test_mean_of_64_short_renders_of_a_rare_lamp(is_naive, monkeypatch):
         take = SampleAllocation._take
         monkeypatch.setattr(
             SampleAllocation, "_take",
-            lambda self, sets, weight: np.where(take(self, sets, weight) > 0, 1.0, 0.0),
+            lambda self, sets, weight: dr.select(take(self, sets, weight) > 0, mi.Float(1), 0),
         )  # fmt: skip
     blind = {**PATH, "max_depth": 2, "hide_emitters": True, "mis": "bsdf"}
     scene = _rare_lamp()
