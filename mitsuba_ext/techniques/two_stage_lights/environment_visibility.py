@@ -104,22 +104,39 @@ class VisibilityCounts(Observer):
         """Frees the counts."""
         self._counts = mi.UInt64()
 
-    def visibility(self) -> np.ndarray:
-        """The probability that a shadow ray arrives, never 0; shape [tiles, rows, columns]."""
-        counts = self.counts.reshape(self.tiles.rows, self.tiles.columns, self.rows, self.columns)
-        tests, seen = (counts & 0xFFFFFFFF).astype(np.float64), (counts >> 32).astype(np.float64)
-        near_tests, near_seen = _with_neighbours(tests), _with_neighbours(seen)
+    def visibility(self) -> mi.Float64:
+        """The probability that a shadow ray arrives, never 0; shape [tiles · rows · columns]."""
+        size = self.rows * self.columns
+        near = self._with_neighbours()
+        # The same for all cells of these tiles
+        all_near = dr.repeat(dr.block_sum(near, size), size)
         # Half a success in one more test keeps the prior from being 0
-        all_tests, all_seen = (
-            x.sum(axis=(2, 3), keepdims=True) for x in (near_tests, near_seen)
-        )
-        prior = (all_seen + 0.5) / (all_tests + 1)
-        prior = (near_seen + _PRIOR_TESTS * prior) / (near_tests + _PRIOR_TESTS)
-        result = (seen + _PRIOR_TESTS * prior) / (tests + _PRIOR_TESTS)
-        return result.reshape(-1, self.rows, self.columns)
+        prior = (_seen(all_near) + 0.5) / (_tests(all_near) + 1)
+        for counts in (near, self._counts):
+            prior = (_seen(counts) + _PRIOR_TESTS * prior) / (_tests(counts) + _PRIOR_TESTS)
+        dr.eval(prior)
+        return prior
+
+    def _with_neighbours(self) -> mi.UInt64:
+        """The sum over each tile and the eight around it."""
+        size = self.rows * self.columns
+        height, width = (dr.opaque(mi.Int32, x) for x in (self.tiles.rows, self.tiles.columns))
+        index = dr.arange(mi.UInt32, len(self._counts))
+        tile = mi.Int32(index // size)
+        y = tile // width
+        x, total = tile - y * width, mi.UInt64(0)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                is_there = (y + down >= 0) & (y + down < height)
+                is_there &= (x + right >= 0) & (x + right < width)
+                near = index + mi.UInt32((down * width + right) * size)
+                total += dr.gather(mi.UInt64, self._counts, near, is_there)
+        return total
 
     def __str__(self) -> str:
-        tests, seen = (int(n.sum()) for n in (self.counts & 0xFFFFFFFF, self.counts >> 32))
+        tests, seen = (
+            int(dr.sum(x)[0]) for x in (self._counts & 0xFFFFFFFF, self._counts >> 32)
+        )
         tiles = self.tiles
         return (
             f"visibility: {tiles.columns} x {tiles.rows} tiles of {tiles.edge} pixels, "
@@ -128,11 +145,12 @@ class VisibilityCounts(Observer):
         )
 
 
-def _with_neighbours(values: np.ndarray) -> np.ndarray:
-    """The sum over each tile and the eight around it."""
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0), (0, 0)))
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+def _tests(counts: mi.UInt64) -> mi.Float64:
+    return mi.Float64(counts & 0xFFFFFFFF)
+
+
+def _seen(counts: mi.UInt64) -> mi.Float64:
+    return mi.Float64(counts >> 32)
 
 
 class PrimaryVisibility:
@@ -146,14 +164,13 @@ class PrimaryVisibility:
 
     def __init__(self, counts: VisibilityCounts, reallocated: float) -> None:
         # The variance is least where the density is the root of the mean square
-        weight = np.sqrt(counts.visibility())
-        size = counts.rows * counts.columns
-        weight *= size / weight.sum(axis=(1, 2), keepdims=True)
-        weight = (1 - reallocated) + reallocated * weight
-        rows = weight.sum(axis=2)
-        self._density = from_numpy(mi.Float, weight)
-        self._of_rows = _cumulative(rows)
-        self._of_columns = _cumulative(weight)
+        weight, size = dr.sqrt(counts.visibility()), counts.rows * counts.columns
+        mean = dr.repeat(dr.block_sum(weight, size), size) / size
+        weight = (1 - reallocated) + reallocated * (weight / mean)
+        self._density = mi.Float(weight)
+        self._of_rows = _cumulative(dr.block_sum(weight, counts.columns), counts.rows)
+        self._of_columns = _cumulative(weight, counts.columns)
+        dr.eval(self._density, self._of_rows, self._of_columns)
         self._counts = counts
 
     def sample(
@@ -176,10 +193,17 @@ class PrimaryVisibility:
         return dr.select(active, dr.gather(mi.Float, self._density, cell, active), 1)
 
 
-def _cumulative(weight: np.ndarray) -> mi.Float:
-    """Sums along the last axis up to and including each entry, scaled so that the last is 1."""
-    sums = np.cumsum(weight, axis=-1)
-    return from_numpy(mi.Float, sums / sums[..., -1:])
+def _cumulative(weight: mi.Float64, count: int) -> mi.Float:
+    """Sums up to and including each entry of its group of ``count`` entries, scaled so that the
+    last is 1."""
+    sums = _running(weight, count)
+    last = dr.arange(mi.UInt32, len(weight)) // count * count + (count - 1)
+    return mi.Float(sums / dr.gather(mi.Float64, sums, last))
+
+
+def _running(values: mi.Float64, count: int) -> mi.Float64:
+    """Running sums of each group of ``count`` values."""
+    return dr.block_prefix_reduce(dr.ReduceOp.Add, values, count, exclusive=False)
 
 
 def _search(table: mi.Float, first: mi.UInt32, count: int, number: mi.Float, active):
@@ -210,16 +234,16 @@ class WorldVisibility:
         self, counts: VisibilityCounts, reallocated: float, emission: np.ndarray, columns: int,
         rows: int,
     ) -> None:  # fmt: skip
-        weight = np.sqrt(counts.visibility())
-        mean = (weight * emission).sum(axis=(1, 2), keepdims=True)
+        weight, size = dr.sqrt(counts.visibility()), counts.rows * counts.columns
+        share = dr.tile(from_numpy(mi.Float64, emission), counts.tiles.count)
+        mean = dr.repeat(dr.block_sum(weight * share, size), size)
         weight = (1 - reallocated) * mean + reallocated * weight
         # Summed-area tables of the weights and of their squares
-        sums = np.zeros((len(weight), counts.rows + 1, counts.columns + 1, 2))
-        values = np.stack([weight, weight**2], axis=-1)
-        sums[:, 1:, 1:] = values.cumsum(axis=1).cumsum(axis=2)
-        self._sums = from_numpy(mi.Float, sums)
-        # Opaque: it differs from render to render, and the kernel must not
-        self._least = dr.opaque(mi.Float, float(weight.min()))
+        tables = (_summed_areas(x, counts) for x in (weight, dr.square(weight)))
+        self._sums = dr.ravel(mi.Point2f(*tables))
+        # No literal: it differs from render to render, and the kernel must not
+        self._least = mi.Float(dr.min(weight))
+        dr.eval(self._sums, self._least)
         self._counts = counts
         self._x, self._y = counts.columns / columns, counts.rows / rows
 
@@ -243,3 +267,19 @@ class WorldVisibility:
         both = ((s[3] - s[2]) - (s[1] - s[0])) / mi.Float((b - a) * (d - c))
         mean = dr.maximum(both.x, self._least)
         return mean, dr.sqrt(dr.maximum(both.y - dr.square(mean), 0))
+
+
+def _summed_areas(values: mi.Float64, counts: VisibilityCounts) -> mi.Float:
+    """The sums over all cells of a tile above and to the left of each corner, for values of shape
+    [tiles, rows, columns]; shape [tiles, rows + 1, columns + 1]."""
+    rows, columns, tiles = counts.rows, counts.columns, counts.tiles.count
+    sums = _running(values, columns)
+    index = dr.arange(mi.UInt32, len(values))
+    column, row = index // rows % columns, index % rows
+    place = (index // (rows * columns) * rows + row) * columns + column
+    # Columns follow one another from here on
+    sums = _running(dr.gather(mi.Float64, sums, place), rows)
+    index = dr.arange(mi.UInt32, tiles * (rows + 1) * (columns + 1))
+    x, y = index % (columns + 1), index // (columns + 1) % (rows + 1)
+    place = (index // ((rows + 1) * (columns + 1)) * columns + x - 1) * rows + y - 1
+    return mi.Float(dr.gather(mi.Float64, sums, place, (x > 0) & (y > 0)))

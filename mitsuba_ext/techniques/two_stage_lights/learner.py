@@ -36,7 +36,7 @@ class VisibilityLearner(Learner):
         self._reallocated = reallocated
         self._counts = VisibilityCounts(width, height, *CELLS[space])
         self._sums: TexelSums | None = None
-        self._state: dict[str, np.ndarray] = {}
+        self._has_learned = False
         self._summary = ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> TwoStage:
@@ -47,12 +47,12 @@ class VisibilityLearner(Learner):
         self._counts.connection(*arguments)
 
     def learn(self, pilot: Pilot) -> TwoStage:
-        self._state = {"counts": self._counts.counts}
+        self._has_learned = True
         self._summary = str(self._counts)
         return self._learned(pilot.scene)
 
     def state(self) -> dict[str, np.ndarray]:
-        return self._state
+        return {"counts": self._counts.counts} if self._has_learned else {}
 
     def restore(self, scene: mi.Scene, state: StoredArrays) -> TwoStage:
         self._sums = TexelSums(EnvironmentTexels(scene))
@@ -62,7 +62,7 @@ class VisibilityLearner(Learner):
 
     def finish(self) -> None:
         self._counts.release()
-        self._sums, self._state = None, {}
+        self._sums, self._has_learned = None, False
 
     def _learned(self, scene: mi.Scene) -> TwoStage:
         counts = self._counts

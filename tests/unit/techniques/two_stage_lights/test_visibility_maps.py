@@ -70,10 +70,10 @@ def test_visibility_is_a_probability_and_follows_the_counts() -> None:
     counts = VisibilityCounts(WIDTH, HEIGHT, 16, 16)
     for kind in KINDS:
         counts.restore(StoredArrays.of({"counts": _counts(kind, (16, 16))}))
-        visibility = counts.visibility()
+        visibility = counts.visibility().numpy()
         assert visibility.min() > 0 and visibility.max() <= 1
     counts.restore(StoredArrays.of({"counts": _counts("one cell", (16, 16))}))
-    visibility = counts.visibility()[4]
+    visibility = counts.visibility().numpy().reshape(-1, 16, 16)[4]
     assert visibility[5, 8] > 0.9 and np.delete(visibility.ravel(), 5 * 16 + 8).max() < 1e-3
 
 
