@@ -46,7 +46,7 @@ def _counts(shape: tuple[int, int], radius: int) -> np.ndarray:
 
 
 def exact_box_sums(running: mi.UInt64, width: int, height: int) -> mi.UInt64:
-    """As :func:`box_sums`, of images of integers on the device.
+    """:func:`box_sums` with the default radius, of images of integers on the device.
 
     Parameters:
         running: The running sums (``dr.cumsum``) of images that follow one another, row by row.

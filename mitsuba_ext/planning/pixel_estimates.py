@@ -46,7 +46,7 @@ class PixelEstimates:
         self._near: mi.UInt64 | None = None
 
     def add(self, pixel: mi.UInt32, radiance: mi.Float) -> None:
-        """Adds samples; those that are not finite count as black."""
+        """Adds samples; those that are negative or not finite count as black."""
         value = mi.Float64(dr.select(dr.isfinite(radiance), dr.maximum(radiance, 0), 0))
         if self._unit == 0:  # all samples until now were black
             mean = float(dr.sum(value)[0]) / max(1, len(value))
