@@ -43,6 +43,15 @@ def channel_mean(value: Any) -> mi.Float:
     return dr.sum(value) * (1 / len(value))
 
 
+def to_host(*columns: Any) -> list[np.ndarray]:
+    """Copies flat arrays of 32-bit numbers to the host, all at once, because each copy waits for
+    the device. They have the same width, or only one element."""
+    words = mi.ArrayXu([dr.reinterpret_array(dr.uint32_array_t(x), x) for x in columns])
+    rows = dr.ravel(words).numpy().reshape(-1, len(columns))
+    types = (np.dtype(dr.type_v(x).name.lower()) for x in columns)
+    return [np.ascontiguousarray(row).view(type_) for row, type_ in zip(rows.T, types)]
+
+
 def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = True) -> None:
     """Adds values to array elements, each of which belongs to one lane.
 

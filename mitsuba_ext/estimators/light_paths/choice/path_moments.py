@@ -14,7 +14,7 @@ from ....images.box_filter import box_means, squares_by_neighbours
 from ....images.coarse_film import CoarseFilm
 from ....transport.estimator import CameraRays, Sample
 from ....transport.mis import power_heuristic
-from ....util.arrays import add_own, channel_mean, from_numpy
+from ....util.arrays import add_own, channel_mean, from_numpy, to_host
 from ..merging.merging import PHOTONS_PER_DISK
 from ..partial_sums import CompetingDensities
 from .candidate_moments import CandidateMoments
@@ -288,30 +288,35 @@ class PathMoments(TechniqueObserver):
         brought = self._brightness(camera.L)
         # The whole sample, since the film reads it too
         dr.eval(camera, brought)
-        pixel = self._pixel.numpy()
+        pixel, values, by_path, squares, merged, joined, *counts = to_host(
+            self._pixel, brought, self._path, self._squares, self._merged, self._joined,
+            self._shadow_count, self._looked, camera.scatter_count, camera.shadow_count,
+            whole.scatter_count,
+        )  # fmt: skip
 
         def per_pixel(values: np.ndarray) -> np.ndarray:
             # NumPy adds in a fixed order: equal seeds give equal sums
             values = np.where(np.isfinite(values), values, 0).astype(np.float64)
             return np.bincount(pixel, values, self._pixels)
 
-        values = brought.numpy().astype(np.float64)
-        by_path = self._path.numpy().astype(np.float64)
+        values, by_path = values.astype(np.float64), by_path.astype(np.float64)
         splats = self._splats.numpy().astype(np.float64).reshape(self._pixels, 2)
         self._sums += (
             np.bincount(pixel, minlength=self._pixels), per_pixel(values), per_pixel(values**2),
-            per_pixel(by_path**2 - self._squares.numpy()), splats[:, 0], splats[:, 1],
-            per_pixel(self._merged.numpy()), per_pixel(self._joined.numpy()),
+            per_pixel(by_path**2 - squares), splats[:, 0], splats[:, 1], per_pixel(merged),
+            per_pixel(joined),
         )  # fmt: skip
         found, by_value = self._moments.taken()
         self._found += found
         self._by_value += by_value
         lanes = len(pixel)
         self.samples += lanes
-        tested, scattered = _total(self._shadow_count), _total(camera.scatter_count)
+        tested, looked, scattered, all_tested, all_scattered = (
+            int(count.sum(dtype=np.uint64)) for count in counts
+        )
         self.counts.add(
-            lanes + scattered, tested, lanes + _total(whole.scatter_count) - scattered,
-            _total(camera.shadow_count) - tested, _total(self._looked),
+            lanes + scattered, tested, lanes + all_scattered - scattered, all_tested - tested,
+            looked,
         )  # fmt: skip
 
     # ---- After the passes ----
@@ -353,7 +358,3 @@ class PathMoments(TechniqueObserver):
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         return box_means(values.reshape(-1, self._width)).ravel()
-
-
-def _total(count: mi.UInt32) -> int:
-    return int(dr.sum(mi.UInt64(count))[0])

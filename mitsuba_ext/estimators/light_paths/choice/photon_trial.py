@@ -21,7 +21,7 @@ from ....rendering.camera import film_extent
 from ....transport.estimator import CameraRays, Estimator, Sample
 from ....transport.numbers import Numbers, schedule_state
 from ....transport.walk import Walk
-from ....util.arrays import add_own, channel_mean
+from ....util.arrays import add_own, channel_mean, to_host
 from ....util.stored_arrays import StoredArrays
 from ..path_tracer import camera_paths
 from ..photons.photon_history import HiddenLight, HiddenLightProgram
@@ -274,16 +274,21 @@ class _Samples(TechniqueObserver):
     def traced(self, camera: Sample, whole: Sample) -> None:
         values = channel_mean(camera.L * self._importance)
         dr.eval(camera, whole, values)
-        values = values.numpy().reshape(-1, self._pixels).astype(np.float64)
+        values, moment, lost, *counts = to_host(
+            values, self._moment, self._lost, self._looked, camera.scatter_count,
+            camera.shadow_count, whole.scatter_count,
+        )  # fmt: skip
+        values, moment, lost = (
+            x.reshape(-1, self._pixels).astype(np.float64) for x in (values, moment, lost)
+        )
         self.passes.append(np.where(np.isfinite(values), values, 0))
-        self.hidden.append([
-            x.numpy().reshape(-1, self._pixels).astype(np.float64)
-            for x in (self._moment, self._lost)
-        ])  # fmt: skip
-        lanes, scattered = values.size, _total(camera.scatter_count)
+        self.hidden.append([moment, lost])
+        lanes = values.size
+        looked, scattered, tested, all_scattered = (
+            int(count.sum(dtype=np.uint64)) for count in counts
+        )
         self.counts.add(
-            lanes + scattered, _total(camera.shadow_count),
-            lanes + _total(whole.scatter_count) - scattered, 0, _total(self._looked),
+            lanes + scattered, tested, lanes + all_scattered - scattered, 0, looked
         )  # fmt: skip
 
 
@@ -316,7 +321,3 @@ def _ratio(of_photons: np.ndarray, of_path: np.ndarray) -> tuple[float, float]:
     the logarithm of this ratio. Both variances are given for each pixel."""
     less, error = gain_of(trimmed_batches(of_photons, of_path - of_photons))
     return max(1 - less, 1e-6), error
-
-
-def _total(count: mi.UInt32) -> int:
-    return int(dr.sum(mi.UInt64(count))[0])
