@@ -28,7 +28,7 @@ from equal_samples import (
 
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
 from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
-from mitsuba_ext.estimators.light_paths.light_walk import STRIDE, LightWalk
+from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.sensor import is_occluded
 from mitsuba_ext.transport.numbers import hashed_2d
 from mitsuba_ext.transport.path_decisions import SceneQuery
@@ -93,10 +93,10 @@ def unblocked(scene: mi.Scene, share: np.ndarray, max_depth: int) -> dict[str, l
     numbers = mi.load_dict({"type": "independent"})
     numbers.seed(1, 1 << 19)
     walk = LightWalk(LightEmission(scene), max_depth, 5, query=query)
-    paths = walk.begin(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, mi.Bool(True))
-    vertices, _ = walk.advance(scene, numbers, paths, STRIDE)
+    active = dr.full(mi.Bool, True, 1 << 19)
+    vertices, _ = walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, active)
     index = dr.arange(mi.UInt32, vertices.count)
-    si = vertices.at(vertices.slot, mi.Bool(True)).si
+    si = vertices.at(index, mi.Bool(True)).si
     u = hashed_2d(index, mi.UInt32(0))
     found: dict[str, list[float]] = {region: [] for region in REGIONS}
     for kind in LENS_SAMPLING:

@@ -10,9 +10,8 @@ from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
 from ...transport.numbers import Numbers, hashed_2d
 from ...transport.path_decisions import SceneQuery
-from ...util.arrays import joined
 from .choice.technique_observer import TechniqueObserver
-from .light_vertices import LightVertices
+from .light_vertices import VertexCache
 from .partial_sums import CompetingDensities, PartialSums, weight
 from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
@@ -70,7 +69,6 @@ class LightImage:
             self._seed = mi.UInt32(numbers.next_1d() * 4294967040.0)
             dr.schedule(self._seed)
         dr.schedule(self._importance)
-        self._found: list[Splats] = []
         self.shadow_count = mi.UInt32(0)
 
     def kernel_state(self) -> tuple:
@@ -80,29 +78,20 @@ class LightImage:
             self._query, self._hides_emitters, self._seed, self._share, self._observer,
         )  # fmt: skip
 
-    def add(self, vertices: LightVertices) -> None:
-        """Connects these vertices, at least one. It evaluates the result, so that the vertices'
-        memory can be freed."""
+    def splats(self, vertices: VertexCache) -> Splats:
+        """Connects these vertices, at least one. The splats are evaluated: otherwise the first
+        reader would evaluate them together with everything else that is scheduled."""
         can_be_frozen = self._observer is None or self._observer.can_be_frozen
         connect = self._connect_frozen if can_be_frozen else self._connect
-        found, tested = connect(vertices, *vertices.lanes())
-        dr.eval(found, tested)
-        self._found.append(found)
+        splats, tested = connect(vertices)
+        dr.eval(splats, tested)
         self.shadow_count += dr.sum(tested)
+        return splats
 
-    def splats(self) -> list[Splats]:
-        """All splats in one list, so that the film adds them by the same kernel for any number of
-        rounds. They are evaluated: otherwise the first reader would evaluate them together with
-        everything else that is scheduled."""
-        if len(self._found) < 2:
-            return self._found
-        return [joined(self._found)]
-
-    def _connect(
-        self, vertices: LightVertices, slot: mi.UInt32, active: mi.Bool
-    ) -> tuple[Splats, mi.UInt32]:
+    def _connect(self, vertices: VertexCache) -> tuple[Splats, mi.UInt32]:
         """The splats, and the number of shadow rays of each vertex."""
-        vertex = vertices.at(slot, active)
+        index, active = vertices.every()
+        vertex = vertices.at(index, active)
         si = vertex.si
         sample = mi.Point2f(0.5)
         if self._seed is not None:

@@ -40,8 +40,8 @@ class LightPathRays:
 
     def emits(self, active: mi.Bool) -> mi.Bool:
         """Which light paths are traced, if the camera rays ``active`` are traced."""
-        lanes = dr.width(active)
-        return active if lanes in (1, self.count) else dr.full(mi.Bool, True, self.count)
+        every = dr.full(mi.Bool, True, self.count)
+        return active & every if dr.width(active) in (1, self.count) else every
 
     def by_camera_path(self, count: mi.UInt32, lanes: int) -> mi.UInt32:
         """Converts a count per light path to ``lanes`` of camera paths. If there is not one light

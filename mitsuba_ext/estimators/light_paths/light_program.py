@@ -21,7 +21,7 @@ class StoredHistory:
 
     Attributes:
         word_count: Number of 32-bit words. If there are any, the first one is 0 at vertices of
-            caustics (:meth:`.LightVertices.is_caustic`).
+            caustics (:meth:`.VertexCache.is_caustic`).
         has_region: Whether the history has a ``region``, which is stored too.
     """
 

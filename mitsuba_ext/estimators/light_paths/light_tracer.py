@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.estimator import CameraRays, Sample
+from ...transport.estimator import CameraRays, Sample, Splats
 from ...transport.numbers import Numbers
 from ...transport.walk import Walk
+from ...util.arrays import joined
 from .light_image import LightImage
-from .light_numbers import light_numbers
+from .light_numbers import LightPathRays
 from .light_walk import LightWalk
 from .sensor import ConnectableSensor
 
@@ -44,13 +45,15 @@ class LightTracer:
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read them again
         dr.schedule(sample, rays.ray.wavelengths)
-        numbers = light_numbers(sampler, dr.width(rays.ray), dr.width(rays.ray))
-        scatter_count = walk.run(
-            scene, numbers, rays.ray.time, rays.ray.wavelengths, active, image.add
-        )
+        light = LightPathRays.of(sampler, rays)
+        splats: list[Splats] = []
+        scatter_count = walk.run_in_rounds(
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active),
+            lambda vertices: splats.append(image.splats(vertices)),
+        )  # fmt: skip
         return replace(
             sample,
-            splats=image.splats(),
+            splats=[joined(splats)] if len(splats) > 1 else splats,
             scatter_count=sample.scatter_count + scatter_count,
             shadow_count=image.shadow_count,
         )

@@ -15,6 +15,9 @@ from .stored_interaction import SHAPE_WORD, as_float, from_words, interaction_wo
 #: path is left.
 _HERO_IS_ALONE = 1 << 31
 
+#: The path of places behind the last vertex.
+_NOBODY = 0xFFFFFFFF
+
 #: Words that Dr.Jit reads and writes at once. A vertex takes a multiple of this number of words.
 _PACKET = 8
 
@@ -55,21 +58,27 @@ class VertexStore:
         layout: The words of a vertex.
         lanes: Number of paths.
         stride: Largest number of vertices of a path.
+
+    Attributes:
+        totals: The number of vertices that were written, and the number of paths that go on. They
+            are the only numbers of a round that the host reads.
     """
 
     def __init__(self, layout: Layout, lanes: int, stride: int) -> None:
-        self.layout, self.stride, self.lanes = layout, stride, lanes
+        self.layout, self.lanes = layout, lanes
+        # Opaque: kernels are the same for paths of all lengths
+        self._stride = dr.opaque(mi.UInt32, stride)
         self.words = dr.empty(mi.Float, lanes * stride * layout.words)
-        self.is_taken = dr.zeros(mi.Bool, lanes * stride)
+        self.totals = dr.zeros(mi.UInt32, 2)
 
-    @property
-    def bytes(self) -> int:
-        """Memory of the store, in bytes."""
-        return self.lanes * self.stride * bytes_per_vertex(self.layout)
+    def places(self) -> tuple[mi.UInt32, mi.UInt32]:
+        """The first place of each path, and the place behind its last one."""
+        first = dr.arange(mi.UInt32, self.lanes) * self._stride
+        return first, first + self._stride
 
     def write(
         self,
-        slot: mi.UInt32,
+        place: mi.UInt32,
         si: mi.SurfaceInteraction3f,
         β: mi.Spectrum,
         history: Any,
@@ -87,13 +96,27 @@ class VertexStore:
         words = [*β, *stored.words(history), as_float(mark)]
         words += to_words(si, self.layout.is_whole)
         words += [mi.Float(0)] * (self.layout.words - len(words))
-        dr.scatter(self.words, mi.ArrayXf(words), slot, active)
-        dr.scatter(self.is_taken, mi.Bool(True), slot, active)
+        dr.scatter(self.words, mi.ArrayXf(words), place, active)
+
+    def finish(self, place: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """Counts what was written.
+
+        Parameters:
+            place: The place behind the last vertex of each path.
+            active: Paths that have not ended.
+
+        Returns:
+            The number of vertices of each path.
+        """
+        number = place - self.places()[0]
+        for index, count in enumerate((number, dr.select(active, mi.UInt32(1), 0))):
+            dr.scatter_add(self.totals, count, mi.UInt32(index), True, dr.ReduceMode.Local)
+        return number
 
 
 def bytes_per_vertex(layout: Layout) -> int:
-    """Bytes of a place in the store: the words, and a flag."""
-    return 4 * layout.words + 1
+    """Bytes of a place in the store."""
+    return 4 * layout.words
 
 
 @dataclass
@@ -118,62 +141,113 @@ class LightVertex:
     lane: mi.UInt32
 
 
-class LightVertices:
-    """The vertices that a pass has stored, as a list without gaps, in the order of the paths and
-    along each path. All of them can be connected: their BSDFs have a smooth part, or they lie in
-    participating media.
+class VertexCache:
+    """The vertices that light paths have stored, as a list without gaps, in the order of the paths
+    and along each path. All of them can be connected: their BSDFs have a smooth part, or they lie
+    in participating media.
 
     Parameters:
-        store: The store that the light walk has written.
+        layout: The words of a vertex.
+        count: Number of vertices.
+        number: The number of vertices of each path.
         time, wavelengths: Time and wavelengths of each path.
         disperses: Whether vertices may have only the hero wavelength left.
 
     Attributes:
+        paths (int): Number of paths.
+        number, end (mi.UInt32): The number of vertices of each path, and the index behind its last
+            vertex.
         count (int): Number of vertices.
-        slot (mi.UInt32): The place of each in the store: path · stride + index along the path.
-        stride (int): Places of each path.
-        bytes (int): Memory that the vertices take.
+        room (int): The number of lanes or places that these vertices have (:func:`room_for`).
     """
 
     def __init__(
-        self, store: VertexStore, time: mi.Float, wavelengths: mi.Spectrum, disperses: bool
+        self,
+        layout: Layout,
+        count: int,
+        number: mi.UInt32,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        disperses: bool,
     ) -> None:
-        self._layout, self._words = store.layout, store.words
-        self._time, self._wavelengths, self._disperses = time, wavelengths, disperses
-        self.stride, self._lane = store.stride, None
-        self.slot = dr.compress(store.is_taken)
-        self.count = len(self.slot)
-        self.room = room_for(self.count)
-        self.bytes = store.bytes + 4 * self.count
+        self._layout, self.number, self._disperses = layout, number, disperses
+        self._time, self._wavelengths = time, wavelengths
+        self.paths, self.count, self.room = len(number), count, room_for(count)
+        self.end = dr.cumsum(number)
+        self._words = dr.empty(mi.Float, self.room * layout.words)
+        self._lane = dr.full(mi.UInt32, _NOBODY, self.room)
+
+    @classmethod
+    def packed(
+        cls,
+        store: VertexStore,
+        count: int,
+        number: mi.UInt32,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        disperses: bool,
+    ) -> VertexCache:
+        """The vertices of a store, without its gaps. The memory of the store is given back."""
+        cache = cls(store.layout, count, number, time, wavelengths, disperses)
+        cache._copy(store.words, store.places()[0], number, cache.end - number)
+        dr.eval(cache._words, cache._lane)
+        store.words = mi.Float()
+        return cache
+
+    @classmethod
+    def joined(cls, rounds: list[VertexCache]) -> VertexCache:
+        """The vertices of some rounds of a light walk. The memory of the rounds is given back."""
+        if len(rounds) == 1:
+            return rounds[0]
+        last, number = rounds[-1], sum((one.number for one in rounds[1:]), rounds[0].number)
+        dr.eval(number)
+        count = sum(one.count for one in rounds)
+        cache = cls(last._layout, count, number, last._time, last._wavelengths, last._disperses)
+        place = cache.end - number
+        for one in rounds:
+            after = place + one.number
+            cache._copy(one._words, one.end - one.number, one.number, place)
+            dr.eval(cache._words, cache._lane, after)
+            one._words, place = mi.Float(), after
+        return cache
+
+    @dr.syntax
+    def _copy(self, words, source, number, target) -> None:
+        """Copies ``number`` vertices of each path from places ``source`` of other memory to
+        ``target``."""
+        lane, index = dr.arange(mi.UInt32, self.paths), dr.zeros(mi.UInt32, self.paths)
+        while dr.hint(index < number, label="vertices of a path"):
+            packet = dr.gather(
+                mi.ArrayXf, words, source + index, shape=(self._layout.words, self.paths)
+            )
+            dr.scatter(self._words, packet, target + index)
+            dr.scatter(self._lane, lane, target + index)
+            index += 1
 
     def kernel_state(self) -> tuple:
         """The arrays and constants that kernels depend on."""
         return (
             self._layout, self._words, self._time, self._wavelengths, self._disperses, self._lane,
-            self.stride,
+            self.end, self.number,
         )  # fmt: skip
 
-    def lanes(self) -> tuple[mi.UInt32, mi.Bool]:
-        """For ``room`` lanes: the place of a vertex in the store, and whether the lane has a
-        vertex."""
-        index = dr.arange(mi.UInt32, self.room)
-        active = index < dr.opaque(mi.UInt32, self.count)
-        slot = dr.gather(mi.UInt32, self.slot, index, active)
-        dr.eval(slot, active)
-        return slot, active
+    def every(self) -> tuple[mi.UInt32, mi.Bool]:
+        """For ``room`` lanes: the index of a vertex, and whether the lane has a vertex."""
+        # A kernel reads the paths of vertices directly, and thus has their width in any recording
+        return dr.arange(mi.UInt32, dr.width(self._lane)), self._lane != _NOBODY
 
-    def at(self, slot: mi.UInt32, active: mi.Bool) -> LightVertex:
-        """The vertices at these places of the store. A vertex must have been written to each."""
+    def at(self, index: mi.UInt32, active: mi.Bool) -> LightVertex:
+        """The vertices with these indices."""
         layout, n = self._layout, self._layout.spectrum
         w = dr.gather(
-            mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
+            mi.ArrayXf, self._words, index, active, shape=(layout.words, dr.width(index))
         )
         mark = dr.reinterpret_array(mi.UInt32, w[layout.mark])
         depth, region = mark & (_HERO_IS_ALONE - 1), None
         if layout.history.has_region:
             depth, region = _depth_and_region(mark)
         history = layout.history.read([w[i] for i in range(n, layout.mark)], depth, region)
-        lane = self._lane_of(slot, active)
+        lane = dr.gather(mi.UInt32, self._lane, index, active)
         si = from_words([w[i] for i in range(layout.mark + 1, layout.words)], layout.is_whole)
         si.t = dr.select(active, mi.Float(0), dr.inf)
         si.time = self._of_lane(self._time, lane, active)
@@ -183,38 +257,38 @@ class LightVertices:
         β = mi.Spectrum(*(w[i] for i in range(n)))
         return LightVertex(si, β, history, depth, hero_is_alone, lane)
 
-    def position(self, slot: mi.UInt32, active: mi.Bool) -> mi.Point3f:
-        """The positions of the vertices at these places of the store."""
-        word = slot * self._layout.words + (self._layout.mark + 1)
+    def position(self, index: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        """The positions of the vertices with these indices."""
+        word = index * self._layout.words + (self._layout.mark + 1)
         return mi.Point3f(*(dr.gather(mi.Float, self._words, word + k, active) for k in range(3)))
 
-    def depth(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """The depths of the vertices at these places of the store."""
-        word = slot * self._layout.words + self._layout.mark
+    def depth(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The depths of the vertices with these indices."""
+        word = index * self._layout.words + self._layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
         if self._layout.history.has_region:
             return _depth_and_region(mark)[0]
         return mark & (_HERO_IS_ALONE - 1)
 
-    def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether light arrives from a delta lobe at the vertices at these places of the store."""
-        word = slot * self._layout.words + self._layout.spectrum
+    def is_caustic(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether light arrives from a delta lobe at the vertices with these indices."""
+        word = index * self._layout.words + self._layout.spectrum
         first = dr.gather(mi.Float, self._words, word, active)
-        return (self.depth(slot, active) > 1) & (first == 0)
+        return (self.depth(index, active) > 1) & (first == 0)
 
-    def is_in_medium(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether the vertices at these places of the store lie in participating media."""
-        word = slot * self._layout.words + (self._layout.mark + 1 + SHAPE_WORD)
+    def is_in_medium(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether the vertices with these indices lie in participating media."""
+        word = index * self._layout.words + (self._layout.mark + 1 + SHAPE_WORD)
         shape = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
         return active & (shape == 0)
 
-    def is_on_surface(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether the vertices at these places of the store lie on surfaces."""
-        return active & ~self.is_in_medium(slot, active)
+    def is_on_surface(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether the vertices with these indices lie on surfaces."""
+        return active & ~self.is_in_medium(index, active)
 
-    def group(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """:func:`group_of` time and wavelengths of the vertices at these places of the store."""
-        lane = self._lane_of(slot, active)
+    def group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """:func:`group_of` time and wavelengths of the vertices with these indices."""
+        lane = dr.gather(mi.UInt32, self._lane, index, active)
         time = self._of_lane(self._time, lane, active)
         return group_of(time, self._of_lane(self._wavelengths, lane, active))
 
@@ -222,91 +296,8 @@ class LightVertices:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
         return self._of_lane(self._wavelengths, vertex.lane, active) if mi.is_spectral else None
 
-    def _lane_of(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        if self._lane is None:
-            return slot // self.stride
-        return dr.gather(mi.UInt32, self._lane, slot, active)
-
     def _of_lane(self, values: Any, lane: mi.UInt32, active: mi.Bool) -> Any:
         return values if dr.width(values) == 1 else dr.gather(type(values), values, lane, active)
-
-
-class PackedVertices(LightVertices):
-    """Vertices without the gaps of a store, which take most of the memory. The place of a vertex
-    is its index.
-
-    Parameters:
-        vertices: The vertices to pack. Their memory is given back.
-    """
-
-    def __init__(self, vertices: LightVertices) -> None:
-        self._share_paths_of(vertices)
-        self.count, self.room, words = vertices.count, vertices.room, self._layout.words
-        self._lane = vertices._lane_of(vertices.slot, mi.Bool(True))
-        packet = dr.gather(
-            mi.ArrayXf, vertices._words, vertices.slot, shape=(words, self.count)
-        )
-        self._words = dr.empty(mi.Float, self.room * words)
-        dr.scatter(self._words, packet, dr.arange(mi.UInt32, self.count))
-        dr.eval(self._words, self._lane)
-        self._lane = _widened(self._lane, self.room)
-        vertices._words = vertices._lane = None
-        self.bytes = self.count * (4 * words + 4)
-
-    def _share_paths_of(self, vertices: LightVertices) -> None:
-        self._layout, self._disperses, self.stride = vertices._layout, vertices._disperses, 1
-        self._time, self._wavelengths = vertices._time, vertices._wavelengths
-
-    @property
-    def slot(self) -> mi.UInt32:
-        return dr.arange(mi.UInt32, self.count)
-
-
-class VertexCache(PackedVertices):
-    """The vertices of some rounds of a light walk. The vertices of a path follow each other.
-
-    Parameters:
-        rounds: The vertices of each round. Their memory is given back.
-        lanes: Number of paths.
-
-    Attributes:
-        first, number (mi.UInt32): The index of each path's first vertex, and its number of
-            vertices.
-    """
-
-    def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
-        if len(rounds) == 1:
-            self.number = _numbers(rounds[0]._lane_of(rounds[0].slot, mi.Bool(True)), lanes)
-            self.first = dr.cumsum(self.number) - self.number
-            super().__init__(rounds[0])
-            return
-        self._share_paths_of(rounds[-1])
-        owners = [v._lane_of(v.slot, mi.Bool(True)) for v in rounds]
-        numbers = [_numbers(lane, lanes) for lane in owners]
-        self.number = sum(numbers[1:], numbers[0])
-        self.first = dr.cumsum(self.number) - self.number
-        self.count, words = sum(vertices.count for vertices in rounds), self._layout.words
-        self.room = room_for(self.count)
-        self._words = dr.empty(mi.Float, self.room * words)
-        self._lane = dr.empty(mi.UInt32, self.room)
-        before = mi.UInt32(self.first)
-        for vertices, lane, number in zip(rounds, owners, numbers):
-            # The first vertex of this path in this round
-            begin = dr.cumsum(number) - number
-            index = dr.arange(mi.UInt32, vertices.count)
-            place = index - dr.gather(mi.UInt32, begin, lane) + dr.gather(mi.UInt32, before, lane)
-            packet = dr.gather(
-                mi.ArrayXf, vertices._words, vertices.slot, shape=(words, vertices.count)
-            )
-            dr.scatter(self._words, packet, place)
-            dr.scatter(self._lane, lane, place)
-            before = before + number
-            dr.eval(self._words, self._lane, before)
-            vertices._words = vertices._lane = None
-        self.bytes = self.count * (4 * words + 4) + 8 * lanes
-
-    def kernel_state(self) -> tuple:
-        return super().kernel_state(), self.first, self.number
 
     @property
     def region(self) -> mi.UInt32:
@@ -331,21 +322,6 @@ def room_for(count: int) -> int:
     of their own."""
     step = max(16, 1 << max(0, count.bit_length() - 4))
     return -(-count // step) * step
-
-
-def _widened(values: mi.UInt32, width: int) -> mi.UInt32:
-    """The values, followed by zeros up to ``width``."""
-    index = dr.arange(mi.UInt32, width)
-    result = dr.gather(mi.UInt32, values, index, index < dr.opaque(mi.UInt32, len(values)))
-    dr.eval(result)
-    return result
-
-
-def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:
-    """The number of vertices of each path. ``lane`` is the path of each vertex."""
-    number = dr.zeros(mi.UInt32, lanes)
-    dr.scatter_add(number, mi.UInt32(1), lane)
-    return number
 
 
 def _depth_and_region(mark: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:

@@ -23,15 +23,15 @@ from .emission import EmittedRay, LightEmission
 from .light_directions import LightDirections
 from .light_media import medium_at_start
 from .light_program import LightProgram
-from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
+from .light_vertices import Layout, VertexCache, VertexStore, bytes_per_vertex
 from .scattering import delta_correction, evaluate
 
 #: Largest number of vertices of a path that are stored in a round; most paths have fewer. A round
 #: stores fewer if the vertices of all paths would take more than half of the memory of a pass.
-STRIDE = 4
+STRIDE = 8
 
-#: Largest number of rounds: a path that is still alive is stuck where nothing absorbs light.
-_MOST_ROUNDS = 1 << 12
+#: Largest number of bounces: a path that is still alive is stuck where nothing absorbs light.
+_MOST_BOUNCES = 1 << 14
 
 
 @dataclass
@@ -70,8 +70,8 @@ class LightPaths:
 class LightWalk:
     """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
 
-    It works in rounds: :meth:`begin` emits rays; each :meth:`advance` walks a limited number of
-    vertices and returns them; :meth:`run` walks until all paths have ended.
+    It works in rounds, each of which stores a limited number of vertices of each path. If one round
+    is enough, one kernel emits the paths and walks. If not, all rounds share a kernel.
 
     A path draws 6 random numbers for the emitted ray and 4 for each bounce; it draws more in scenes
     with media.
@@ -106,72 +106,6 @@ class LightWalk:
         is_whole = self.emission.needs_whole_interaction
         return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole)
 
-    def begin(
-        self,
-        scene: mi.Scene,
-        numbers: Numbers,
-        time: mi.Float,
-        wavelengths: mi.Spectrum,
-        active: mi.Bool,
-    ) -> LightPaths:
-        """Emits a ray in each lane, and traces it.
-
-        Parameters:
-            time, wavelengths: Time and wavelengths of each path, the same as for the camera path in
-                its lane.
-            active: Lanes that emit.
-        """
-        paths, place = self._begin(scene, numbers, time, wavelengths, active)
-        go_to(numbers, place)
-        return paths
-
-    @frozen
-    def _begin(self, scene, numbers, time, wavelengths, active) -> tuple[LightPaths, Any]:
-        numbers = copied(numbers)
-        with garbage_left_alone():
-            active = mi.Bool(active) & (self.max_depth > 1)
-            emitted = self.emission.sample(numbers, time, wavelengths, active)
-            active &= dr.max(emitted.weight) > 0
-            ray, inside = self._launch(scene, numbers, emitted, active)
-            pi = self.query.closest(scene, ray, coherent=False, active=active)
-            active &= self._media(scene).meets(pi, inside)
-            history = self.program.first(scene, self.query, emitted, pi, active)
-            width = dr.width(emitted.ray)
-            # The same width as in later rounds and in all renders: otherwise, kernels would differ
-            ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
-            paths = LightPaths(
-                ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
-                dr.full(mi.Float, 1, width), history, dr.full(mi.UInt32, 1, width),
-                Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
-            )  # fmt: skip
-            if paths.hero_is_alone is not None:
-                paths.hero_is_alone = dr.zeros(mi.Bool, width)
-            return paths, reached(numbers)
-
-    def advance(
-        self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
-    ) -> tuple[LightVertices, LightPaths]:
-        """Walks up to ``stride`` more vertices. It evaluates ``paths``, so that rounds share a
-        kernel.
-
-        Returns:
-            The vertices whose BSDF has a smooth part, or that lie in a medium, and the new state of
-            the paths.
-        """
-        schedule_state(numbers)
-        # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
-        dr.make_opaque(paths)
-        dr.eval(paths)
-        store = VertexStore(self.layout, dr.width(paths.active), stride)
-        time, wavelengths = paths.ray.time, paths.ray.wavelengths
-        paths, place = self._go_on(scene, numbers, paths, store)
-        go_to(numbers, place)
-        # In the same kernel: evaluating the sampler's state later would trace the walk again
-        schedule_state(numbers)
-        dr.eval(paths, store.words, store.is_taken)
-        disperses = paths.hero_is_alone is not None
-        return LightVertices(store, time, wavelengths, disperses), paths
-
     def run(
         self,
         scene: mi.Scene,
@@ -179,40 +113,128 @@ class LightWalk:
         time: mi.Float,
         wavelengths: mi.Spectrum,
         active: mi.Bool,
-        take: Callable[[LightVertices], None],
+    ) -> tuple[VertexCache | None, mi.UInt32]:
+        """Like :meth:`run_in_rounds`, but the vertices of all rounds are joined.
+
+        Returns:
+            The vertices, ``None`` if there are none; and for each path, the rays traced in
+            directions that were sampled from a BSDF.
+        """
+        rounds: list[VertexCache] = []
+        scatter_count = self.run_in_rounds(scene, numbers, time, wavelengths, active, rounds.append)
+        return VertexCache.joined(rounds) if rounds else None, scatter_count
+
+    def run_in_rounds(
+        self,
+        scene: mi.Scene,
+        numbers: Numbers,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        active: mi.Bool,
+        take: Callable[[VertexCache], None],
     ) -> mi.UInt32:
         """Traces light paths until all have ended. ``take`` is called with the vertices of each
-        round that has any: at most ``STRIDE`` per path. See :meth:`begin` for the other parameters.
+        round that has any: at most ``STRIDE`` per path.
+
+        Parameters:
+            time, wavelengths: Time and wavelengths of each path, the same as for the camera path in
+                its lane.
+            active: Lanes that emit. It has the width of the paths.
 
         Returns:
             For each path, the rays traced in directions that were sampled from a BSDF.
         """
-        paths = self.begin(scene, numbers, time, wavelengths, active)
+        lanes = dr.width(active)
+        room = device_of(mi.Float).pass_bytes // 2 // (lanes * bytes_per_vertex(self.layout))
+        stride = min(STRIDE, max(1, room))
+        schedule_state(numbers)
+        # Each vertex is one segment deeper than the one before, except in media
+        if self.max_depth <= stride + 1 and not self._media(scene).exist:
+            store = VertexStore(self.layout, lanes, max(1, self.max_depth - 1))
+            walked = self._whole(scene, numbers, time, wavelengths, active, store)
+            self._take(scene, numbers, store, walked, time, wavelengths, take)
+            return walked[0]
+        paths, place = self._begin(scene, numbers, time, wavelengths, active)
+        go_to(numbers, place)
         dr.eval(paths)
-        bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout)
-        stride = min(STRIDE, max(1, device_of(mi.Float).pass_bytes // 2 // bytes_per_place))
-        for _ in range(_MOST_ROUNDS):
-            vertices, paths = self.advance(scene, numbers, paths, stride)
-            if vertices.count > 0:
-                take(vertices)
-            if not dr.any(paths.active)[0]:
-                break
+        goes_on = True
+        while goes_on:
+            schedule_state(numbers)
+            # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
+            dr.make_opaque(paths)
+            time, wavelengths = paths.ray.time, paths.ray.wavelengths
+            store = VertexStore(self.layout, lanes, stride)
+            walked = self._go_on(scene, numbers, paths, store)
+            paths = walked[0]
+            goes_on = self._take(scene, numbers, store, walked, time, wavelengths, take)
         return paths.scatter_count
 
+    def _take(self, scene, numbers, store, walked, time, wavelengths, take) -> bool:
+        """Evaluates what a round has ``walked``, and gives its vertices to ``take``. Returns
+        whether paths go on."""
+        state, number, place = walked
+        go_to(numbers, place)
+        # In the same kernel: evaluating the sampler's state later would trace the walk again
+        schedule_state(numbers)
+        dr.eval(state, number, store.words, store.totals)
+        count, going_on = store.totals.numpy()
+        if count > 0:
+            disperses = Heroes(scene).begin() is not None
+            take(VertexCache.packed(store, int(count), number, time, wavelengths, disperses))
+        return going_on > 0
+
     @frozen
-    def _go_on(self, scene, numbers, paths, store) -> tuple[LightPaths, Any]:
+    def _whole(
+        self, scene, numbers, time, wavelengths, active, store
+    ) -> tuple[mi.UInt32, mi.UInt32, Any]:
+        """Emits the paths, and walks until all have ended. Returns their numbers of rays."""
         with garbage_left_alone():
-            numbers, paths = self._trace(scene, copied(numbers), paths, store)
-        return paths, reached(numbers)
+            numbers = copied(numbers)
+            paths = self._emitted(scene, numbers, time, wavelengths, active)
+            numbers, paths, number = self._trace(scene, numbers, paths, store)
+        return paths.scatter_count, number, reached(numbers)
+
+    @frozen
+    def _begin(self, scene, numbers, time, wavelengths, active) -> tuple[LightPaths, Any]:
+        with garbage_left_alone():
+            numbers = copied(numbers)
+            return self._emitted(scene, numbers, time, wavelengths, active), reached(numbers)
+
+    @frozen
+    def _go_on(self, scene, numbers, paths, store) -> tuple[LightPaths, mi.UInt32, Any]:
+        with garbage_left_alone():
+            numbers, paths, number = self._trace(scene, copied(numbers), paths, store)
+        return paths, number, reached(numbers)
+
+    def _emitted(self, scene, numbers, time, wavelengths, active) -> LightPaths:
+        """Emits a ray in each lane, and traces it."""
+        active = mi.Bool(active) & (self.max_depth > 1)
+        emitted = self.emission.sample(numbers, time, wavelengths, active)
+        active &= dr.max(emitted.weight) > 0
+        ray, inside = self._launch(scene, numbers, emitted, active)
+        pi = self.query.closest(scene, ray, coherent=False, active=active)
+        active &= self._media(scene).meets(pi, inside)
+        history = self.program.first(scene, self.query, emitted, pi, active)
+        width = dr.width(emitted.ray)
+        # The same width as in later rounds and in all renders: otherwise, kernels would differ
+        ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
+        paths = LightPaths(
+            ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
+            dr.full(mi.Float, 1, width), history, dr.full(mi.UInt32, 1, width),
+            Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
+        )  # fmt: skip
+        if paths.hero_is_alone is not None:
+            paths.hero_is_alone = dr.zeros(mi.Bool, width)
+        return paths
 
     @dr.syntax
-    def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
+    def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths, mi.UInt32]:
+        """Returns the state of the paths, and the number of vertices that each has stored."""
         heroes, media, directions = Heroes(scene), self._media(scene), self._directions()
         ctx = heroes.context()
         ctx.mode = mi.TransportMode.Importance
-        place = dr.arange(mi.UInt32, store.lanes) * store.stride
-        # No vertex of a path is stored beyond this place
-        end = place + store.stride
+        # The next place for a vertex of a path, and the place behind its last one
+        place, end = store.places()
         last_depth = dr.opaque(mi.UInt32, self.max_depth - 1)
         rr_depth = dr.opaque(mi.UInt32, self.rr_depth)
         # A copy: the loop's mask is not the paths' mask
@@ -227,11 +249,12 @@ class LightWalk:
             stores = self._stores(bsdf)
 
             # ----- Store the vertex if it can be connected -----
+            is_stored = active & self._is_stored(media, vertex, stores)
             store.write(
                 place, si, paths.emitted * media.arriving(β, vertex), history, paths.depth,
-                paths.hero_is_alone, active & self._is_stored(media, vertex, stores),
+                paths.hero_is_alone, is_stored,
             )  # fmt: skip
-            place += 1
+            place += dr.select(is_stored, 1, 0)
 
             # ----- Sample the BSDF -----
             active_next = self._goes_on(media, vertex, last_depth, active)
@@ -261,13 +284,13 @@ class LightWalk:
             ray, inside = media.launch(inside, numbers, CameraRays(ray), ray, active_next)
             pi = self.query.closest(scene, ray, coherent=False, active=active_next)
             scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
-            active_next &= media.meets(pi, inside)
+            active_next &= media.meets(pi, inside) & (scatter_count < _MOST_BOUNCES)
             paths = LightPaths(
                 ray, pi, paths.emitted, β, sampling_weight, history, depth, hero_is_alone,
                 scatter_count, inside, active_next,
             )  # fmt: skip
             active = active_next & (place < end)
-        return numbers, paths
+        return numbers, paths, store.finish(place, paths.active)
 
     def _directions(self) -> LightDirections:
         """The object that samples directions."""

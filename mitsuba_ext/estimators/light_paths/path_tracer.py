@@ -25,7 +25,6 @@ from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
 from .light_numbers import LightPathRays
-from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths
 from .merging.merging_radius import MergingRadius
@@ -109,7 +108,6 @@ class BidirectionalPathTracer:
             paths = min(lanes, self.radius.pixels) if own_lane else light.count
             radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
-            dr.make_opaque(merging)
         sums = PartialSums(
             dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,
             merges_all=self.merges_all, light_paths=dr.opaque(mi.Float, per_camera_path),
@@ -128,20 +126,13 @@ class BidirectionalPathTracer:
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
-        rounds: list[LightVertices] = []
-
-        def take(vertices: LightVertices) -> None:
-            if image is not None:
-                image.add(vertices)
-            rounds.append(PackedVertices(vertices))
-
-        scatter_count = light_walk.run(
-            scene, light.numbers, light.time, light.wavelengths, light.emits(active), take
+        vertices, scatter_count = light_walk.run(
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active)
         )
-        splats = image.splats() if image is not None else []
-        subpaths = None
-        if rounds:
-            vertices = VertexCache(rounds, light.count)
+        splats, subpaths = [], None
+        if vertices is not None:
+            if image is not None:
+                splats.append(image.splats(vertices))
             if selection is not None:
                 choice = RegionChoice(vertices, selection)
             else:

@@ -46,7 +46,7 @@ class VertexChoice:
     def __init__(self, vertices: VertexCache) -> None:
         self._vertices = vertices
         self._count = dr.opaque(mi.UInt32, vertices.count)
-        self._mean = dr.opaque(mi.Float, vertices.count / len(vertices.first))
+        self._mean = dr.opaque(mi.Float, vertices.count / vertices.paths)
 
     def numbers(self, sampler: mi.Sampler) -> tuple[mi.Point2f, ...]:
         """The random numbers that choose a vertex."""
@@ -64,11 +64,11 @@ class OwnVertexChoice(VertexChoice):
 
     def __init__(self, vertices: VertexCache) -> None:
         super().__init__(vertices)
-        self._lane = dr.arange(mi.UInt32, len(vertices.first))
+        self._lane = dr.arange(mi.UInt32, vertices.paths)
 
     def choose(self, numbers, vertex, active):
-        first = dr.gather(mi.UInt32, self._vertices.first, self._lane, active)
         number = dr.gather(mi.UInt32, self._vertices.number, self._lane, active)
+        first = dr.gather(mi.UInt32, self._vertices.end, self._lane, active) - number
         return Chosen(first + below(number, numbers[0]), mi.Float(number), active & (number > 0))
 
 
@@ -89,7 +89,7 @@ class RegionChoice(VertexChoice):
         dr.scatter_add(number, mi.UInt32(1), region)
         self._range = mi.ArrayXu([dr.cumsum(number) - number, number])
         self._range = dr.ravel(self._range)
-        self._share = dr.opaque(mi.Float, 1 / len(vertices.first))
+        self._share = dr.opaque(mi.Float, 1 / vertices.paths)
         dr.eval(self._order, self._range)
 
     def numbers(self, sampler):

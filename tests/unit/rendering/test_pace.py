@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.estimators.light_paths import light_walk
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import pace
 from mitsuba_ext.rendering import render as rendering
@@ -182,10 +183,14 @@ def test_all_pilots_share_a_kernel():
     assert sorted(_large_kernels(_scene(), integrator, 64).values()) == [1, 1, 3]
 
 
-def test_the_light_walk_has_one_kernel():
+def test_the_light_walk_has_one_kernel(monkeypatch):
     glass = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}}
     kernels = _large_kernels(_scene(glass=glass), _integrator("vcm", max_depth=8), 4)
-    # Two rounds in the pass, and two for the radius
+    # In the pass, and for the radius
+    assert max(kernels.values()) == 2
+    # Two rounds each
+    monkeypatch.setattr(light_walk, "STRIDE", 4)
+    kernels = _large_kernels(_scene(glass=glass), _integrator("vcm", max_depth=8), 4)
     assert max(kernels.values()) == 4
 
 

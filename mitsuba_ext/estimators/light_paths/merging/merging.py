@@ -22,11 +22,11 @@ from ....transport.path_decisions import SceneQuery
 from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
 from ..choice.technique_observer import TechniqueObserver
-from ..light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache, group_of
+from ..light_vertices import LightVertex, VertexCache, group_of
 from ..light_walk import LightWalk
 from ..partial_sums import PartialSums
 from ..scattering import geometric_cosine, reverse_density
-from .vertex_grid import VertexGrid
+from .vertex_grid import VertexCounts, VertexGrid
 
 #: Vertices merge if their surfaces face about the same way, and within a flat cylinder. Light would
 #: otherwise leak around corners and through thin walls. These are the least cosine between the
@@ -141,7 +141,6 @@ def pilot_vertices(
     scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk
 ) -> VertexCache | None:
     """The vertices of ``PILOT_PATHS`` light paths; ``None`` if there are none."""
-    rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, 0), PILOT_PATHS)
     # Times and wavelengths are distributed as in the sensor's rays
@@ -150,13 +149,8 @@ def pilot_vertices(
         sensor.shutter_open() + numbers.x * sensor.shutter_open_time(), numbers.y,
         mi.Point2f(0.5), mi.Point2f(0.5),
     )  # fmt: skip
-    light_walk.run(
-        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, PILOT_PATHS),
-        lambda vertices: rounds.append(PackedVertices(vertices)),
-    )  # fmt: skip
-    if not rounds:
-        return None
-    return VertexCache(rounds, PILOT_PATHS)
+    active = dr.full(mi.Bool, True, PILOT_PATHS)
+    return light_walk.run(scene, sampler, rays.time, rays.wavelengths, active)[0]
 
 
 def disk_radius(
@@ -174,10 +168,10 @@ def disk_radius(
     """
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
-        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
-        if grid.count < FEW:
+        counts = VertexCounts(vertices, dr.opaque(mi.Float, radius), kept)
+        if counts.count < FEW:
             return None
-        others = grid.occupancy
+        others = counts.occupancy
         if others > 4:
             break
     # Cubes cut squares of two radii out of a surface
@@ -224,7 +218,6 @@ class MergedSubpaths(Subpaths):
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
         # The density of light paths, for one vertex within the radius
         self._per_vertex = dr.rcp(self._measure(grid.radius) * dr.opaque(mi.Float, paths))
-        dr.make_opaque(self._per_vertex)
 
     def _measure(self, radius: mi.Float) -> mi.Float:
         """The area in which vertices are found."""

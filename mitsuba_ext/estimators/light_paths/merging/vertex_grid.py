@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +16,105 @@ from ..light_vertices import VertexCache
 #: all cells of a row that a ball overlaps are one range.
 _PER_DIAMETER, _ROWS = 2, 4
 
+#: Functions of vertices, which are given by their indices and a mask: whether they are kept, and
+#: their groups.
+Kept = Callable[["mi.UInt32", "mi.Bool"], "mi.Bool"]
+Group = Callable[["mi.UInt32", "mi.Bool"], "mi.UInt32"]
 
-class VertexGrid:
-    """The vertices, sorted by the cell of a regular grid that they lie in. Cells are numbered by a
-    hash, so that memory does not depend on the size of the scene.
+
+class Counted(NamedTuple):
+    """The vertices while they are counted.
+
+    Attributes:
+        index, active: A vertex in each lane, and whether the lane has one that is kept.
+        p: Its position.
+        hashed, bucket: The number of its row of cells, and the bucket of its cell.
+        rank: The number of vertices of this bucket that were counted before.
+        counts: The number of vertices in each bucket.
+    """
+
+    index: mi.UInt32
+    active: mi.Bool
+    p: mi.Point3f
+    hashed: mi.UInt32
+    bucket: mi.UInt32
+    rank: mi.UInt32
+    counts: mi.UInt32
+
+
+class Cells:
+    """A regular grid. Its cells are numbered by a hash, so that memory does not depend on the size
+    of the scene.
+
+    Parameters:
+        radius: Radius of the balls in which vertices are looked for.
+        room: The number of buckets is at least this number.
+    """
+
+    def __init__(self, radius: mi.Float, room: int) -> None:
+        scale = 0.5 / radius
+        self._scale = mi.Vector3f(_PER_DIAMETER * scale, scale, scale)
+        # A power of two: kernels are shared
+        self._buckets = 1 << (room - 1).bit_length()
+        self._mask = dr.opaque(mi.UInt32, self._buckets - 1)
+
+    def _count(self, vertices: VertexCache, kept: Kept | None, group: Group | None) -> Counted:
+        """Counts the vertices in each bucket. Nothing is evaluated."""
+        index, active = vertices.every()
+        if kept is not None:
+            active &= kept(index, active)
+        p = vertices.position(index, active)
+        cell = self._cell(p)
+        hashed = _hash(cell, mi.UInt32(0) if group is None else group(index, active))
+        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
+        counts = dr.zeros(mi.UInt32, self._buckets)
+        rank = dr.scatter_inc(counts, bucket, active)
+        return Counted(index, active, p, hashed, bucket, rank, counts)
+
+    def _cell(self, p: mi.Point3f) -> mi.Vector3i:
+        return mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale))
+
+
+class VertexCounts(Cells):
+    """The number of vertices in each cube of a grid, two radii wide. There must be few vertices,
+    because buckets are counted as cells.
+
+    Parameters:
+        vertices, radius, kept: See :class:`VertexGrid`.
+    """
+
+    def __init__(self, vertices: VertexCache, radius: mi.Float, kept: Kept | None) -> None:
+        super().__init__(radius, vertices.room)
+        counted = self._count(vertices, kept, None)
+        dr.eval(counted.rank, counted.counts)
+        # The two buckets of a cube follow each other, since hashes are even
+        even = 2 * dr.arange(mi.UInt32, self._buckets // 2)
+        counts = dr.gather(mi.UInt32, counted.counts, even)
+        self._cubes = mi.Float64(counts + dr.gather(mi.UInt32, counted.counts, even + 1))
+        dr.eval(self._cubes)
+        self._total = dr.sum(self._cubes)
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return int(self._total[0])
+
+    @property
+    def occupancy(self) -> float:
+        """The number of other vertices in the cube around a vertex, on average over the vertices.
+        There must be at least one vertex."""
+        return float((dr.dot(self._cubes, self._cubes) / self._total)[0]) - 1
+
+    @property
+    def median_occupancy(self) -> float:
+        """Like :attr:`occupancy`, but the median over the vertices."""
+        counts = np.sort(self._cubes.numpy())
+        vertices = np.cumsum(counts)
+        return float(counts[np.searchsorted(vertices, 0.5 * vertices[-1])]) - 1
+
+
+class VertexGrid(Cells):
+    """The vertices, sorted by the cell of a regular grid that they lie in.
 
     The order of the vertices in a cell depends on threads; sums over them therefore differ from run
     to run by rounding.
@@ -38,80 +133,44 @@ class VertexGrid:
         self,
         vertices: VertexCache,
         radius: mi.Float,
-        kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None = None,
-        group: Callable[[mi.UInt32, mi.Bool], mi.UInt32] | None = None,
+        kept: Kept | None = None,
+        group: Group | None = None,
     ) -> None:
+        # As many buckets as there is room for vertices
+        super().__init__(radius, vertices.room)
         self.radius = radius
-        scale = 0.5 / radius
-        self._scale = mi.Vector3f(_PER_DIAMETER * scale, scale, scale)
-        dr.make_opaque(self._scale)
-        # As many buckets as there is room for vertices, a power of two: kernels are shared
-        buckets = 1 << (vertices.room - 1).bit_length()
-        self._mask = dr.opaque(mi.UInt32, buckets - 1)
-        index = dr.arange(mi.UInt32, vertices.room)
-        active = index < dr.opaque(mi.UInt32, vertices.count)
-        if kept is not None:
-            active &= kept(index, active)
-        p = vertices.position(index, active)
-        cell = self._cell(p)
-        hashed = _hash(cell, mi.UInt32(0) if group is None else group(index, active))
-        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
-        self._counts, tags = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
-        rank = dr.scatter_inc(self._counts, bucket, active)
+        index, active, p, hashed, bucket, rank, counts = self._count(vertices, kept, group)
+        tags = dr.zeros(mi.UInt32, self._buckets)
         dr.scatter_reduce(dr.ReduceOp.Or, tags, _tag(hashed), bucket, active)
-        dr.eval(rank, self._counts, tags)
-        ends = dr.cumsum(self._counts)
-        starts = ends - self._counts
+        dr.eval(rank, counts, tags)
+        starts = dr.prefix_reduce(dr.ReduceOp.Add, counts, exclusive=True)
         place = dr.gather(mi.UInt32, starts, bucket, active) + rank
         self._sorted = dr.empty(mi.Float, 4 * vertices.room)
         packet = mi.Vector4f(p.x, p.y, p.z, dr.reinterpret_array(mi.Float, index))
         dr.scatter(self._sorted, packet, place, active)
-        self._total = dr.gather(mi.UInt32, ends, buckets - 1)
+        final = mi.UInt32(self._mask)
+        self._total = dr.gather(mi.UInt32, starts, final) + dr.gather(mi.UInt32, counts, final)
         # For each bucket, the range of places from its first vertex to the last vertex of the
         # buckets that a ball overlaps, and the tags of their cells. The first bucket follows the
         # last one
-        first = dr.arange(mi.UInt32, buckets)
+        first = dr.arange(mi.UInt32, self._buckets)
         last = first + _PER_DIAMETER
-        end = dr.gather(mi.UInt32, ends, last & self._mask)
+        end = dr.gather(mi.UInt32, starts, last & self._mask)
+        end += dr.gather(mi.UInt32, counts, last & self._mask)
         end += dr.select(last > self._mask, self._total, 0)
         for k in range(1, _PER_DIAMETER + 1):
             tags = tags | dr.gather(mi.UInt32, tags, (first + k) & self._mask)
         self._ranges = dr.ravel(mi.Vector4u(starts, end, tags, 0))
-        dr.eval(self._ranges, self._sorted, self._total)
+        dr.eval(self._ranges, self._sorted, self._total, self._scale)
 
     @property
     def count(self) -> int:
         """Number of vertices."""
         return int(self._total[0])
 
-    @property
-    def occupancy(self) -> float:
-        """The number of other vertices in a cube around a vertex, two radii wide, on average over
-        the vertices. The grid must have few vertices, because buckets are counted as cells."""
-        counts = mi.Float64(self._cubes())
-        total, squares = dr.sum(counts), dr.sum(dr.square(counts))
-        return float((squares / dr.maximum(total, 1))[0]) - 1
-
-    @property
-    def median_occupancy(self) -> float:
-        """Like :attr:`occupancy`, but the median over the vertices."""
-        counts = np.sort(self._cubes().numpy())
-        vertices = np.cumsum(counts)
-        return float(counts[np.searchsorted(vertices, 0.5 * vertices[-1])]) - 1
-
-    def _cubes(self) -> mi.UInt32:
-        """The number of vertices in each cube, two radii wide."""
-        # The two buckets of such a cube follow each other, since hashes are even
-        even = 2 * dr.arange(mi.UInt32, len(self._counts) // 2)
-        counts = dr.gather(mi.UInt32, self._counts, even)
-        return counts + dr.gather(mi.UInt32, self._counts, even + 1)
-
     def kernel_state(self) -> tuple:
         """The arrays that kernels depend on."""
         return self.radius, self._scale, self._mask, self._total, self._ranges, self._sorted
-
-    def _cell(self, p: mi.Point3f) -> mi.Vector3i:
-        return mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale))
 
     def crowd(self, p: mi.Point3f, active: mi.Bool) -> mi.UInt32:
         """The number of vertices in the cells that a ball around ``p`` overlaps: on a surface, they

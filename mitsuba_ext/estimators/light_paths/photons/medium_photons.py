@@ -40,7 +40,7 @@ from ..merging.merging import (
     pushed,
     scene_diagonal,
 )
-from ..merging.vertex_grid import VertexGrid
+from ..merging.vertex_grid import VertexCounts, VertexGrid
 
 #: The number of points at which a ray gathers light on its way through a homogeneous medium. (In
 #: volume_caustic, 64 samples: 1 has 0.82 of the efficiency, 2 0.97, 8 0.88, 16 0.67.)
@@ -209,10 +209,10 @@ def suitable_ball(
     least = 2 * footprint or scene_diagonal(scene) / 500
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
-        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), vertices.is_in_medium)
-        if grid.count < FEW:
+        counts = VertexCounts(vertices, dr.opaque(mi.Float, radius), vertices.is_in_medium)
+        if counts.count < FEW:
             return None
-        others = grid.median_occupancy
+        others = counts.median_occupancy
         if others > 4:
             break
     per_volume = max(others, 1e-6) / (2 * radius) ** 3

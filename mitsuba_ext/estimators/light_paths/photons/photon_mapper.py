@@ -22,7 +22,7 @@ from ....transport.path_program import EndingProgram, Subpaths
 from ....transport.walk import Walk
 from ..choice.technique_observer import TechniqueObserver
 from ..light_numbers import LightPathRays
-from ..light_vertices import LightVertices, PackedVertices, VertexCache
+from ..light_vertices import VertexCache
 from ..light_walk import LightWalk
 from ..merging.merging import MergedSubpaths
 from ..merging.merging_radius import MergingRadius
@@ -93,16 +93,14 @@ class PhotonMapper:
             self.observer.camera(rays)
         lanes = dr.width(rays.ray)
         light = LightPathRays.of(sampler, rays, self.light_paths)
-        rounds: list[LightVertices] = []
-        scatter_count = self.light_walk.run(
-            scene, light.numbers, light.time, light.wavelengths, light.emits(active),
-            lambda vertices: rounds.append(PackedVertices(vertices)),
-        )  # fmt: skip
+        vertices, scatter_count = self.light_walk.run(
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active)
+        )
         walk, merged = self.walk, None
-        if rounds:
+        if vertices is not None:
             if self.ball is not None:
                 walk = replace(walk, distance=PassesThrough())
-            merged = self._merged(scene, VertexCache(rounds, light.count), light.count)
+            merged = self._merged(scene, vertices, light.count)
         walk = replace(walk, program=SpecularPaths(merged))
         sample = walk(scene, sampler, rays, active)
         scatter_count = light.by_camera_path(scatter_count, lanes)

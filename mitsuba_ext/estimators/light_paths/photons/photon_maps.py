@@ -13,7 +13,6 @@ Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illuminatio
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,19 +20,16 @@ import mitsuba as mi
 
 from ....transport.heroes import Heroes
 from ....transport.path_program import Subpaths
-from ..light_vertices import LightVertices, PackedVertices, VertexCache
+from ..light_vertices import VertexCache
 from ..light_walk import LightWalk
 from ..merging.merging import MergedSubpaths, disk_radius, scene_diagonal
-from ..merging.vertex_grid import VertexGrid
+from ..merging.vertex_grid import Kept, VertexGrid
 from .gathering_paths import BEFORE, is_diffuse
 from .photon_history import PhotonProgram
 
 #: The radii of a map: how many, and the ratio of one to the one before. Where the search for a
 #: suitable one begins, at most, and the largest one, in units of the diagonal of the scene.
 _LEVELS, _STEP, _LEAST, _WIDEST = 4, 2.0, 1e-3, 0.05
-
-#: Tells which vertices are in a grid.
-Kept = Callable[[mi.UInt32, mi.Bool], mi.Bool]
 
 
 @dataclass
@@ -90,17 +86,14 @@ class PhotonMaps:
             lookup_size: Number of photons that an estimate should use.
             least: See :func:`disk_radius`; 0 for one that suits the scene.
         """
-        rounds: list[LightVertices] = []
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, (0x9E3779B9 * (seed + 1)) & 0xFFFFFFFF), paths)
         rays = dr.zeros(mi.Ray3f, paths)
-        light_walk.run(
-            scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, paths),
-            lambda vertices: rounds.append(PackedVertices(vertices)),
-        )  # fmt: skip
-        if not rounds:
+        vertices, _ = light_walk.run(
+            scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, paths)
+        )
+        if vertices is None:
             return cls()
-        vertices = VertexCache(rounds, paths)
 
         def indirect(index: mi.UInt32, active: mi.Bool) -> mi.Bool:
             return (vertices.depth(index, active) > 1) & ~vertices.is_caustic(index, active)
@@ -127,7 +120,7 @@ class PhotonMaps:
 
     def estimates(self, scene: mi.Scene, max_depth: int) -> list[PhotonEstimate | None]:
         """Estimates of radiance from the map of caustics and the global one."""
-        heroes, paths = Heroes(scene), len(self.vertices.first) if self.vertices else 0
+        heroes, paths = Heroes(scene), self.vertices.paths if self.vertices else 0
         return [
             m and PhotonEstimate(m, [
                 MergedSubpaths(self.vertices, grid, None, heroes, max_depth, paths)

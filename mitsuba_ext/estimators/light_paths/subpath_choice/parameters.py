@@ -16,7 +16,6 @@ from ....scene.regions.surface_voxels import lit_normal
 from ....transport.queries.scene import scene_query
 from ..both_ends import from_both_ends
 from ..emission import LightEmission
-from ..light_vertices import LightVertices, PackedVertices, VertexCache
 from ..light_walk import LightWalk
 from .region_learner import LightVertexSample, RegionLearner
 
@@ -59,15 +58,9 @@ def _light_vertices(setting: Setting) -> LightVertexSample:
     # The same for all seeds: the vertices decide the size of tables, and so change kernels
     numbers.seed(0, _PATHS)
     active = dr.full(mi.Bool, True, _PATHS)
-    rounds: list[LightVertices] = []
-
-    def take(vertices: LightVertices) -> None:
-        rounds.append(PackedVertices(vertices))
-
-    walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, active, take)
-    if not rounds:
+    vertices, _ = walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, active)
+    if vertices is None:
         return LightVertexSample(mi.Point3f(), mi.Normal3f(), mi.Float(), _PATHS)
-    vertices = VertexCache(rounds, _PATHS)
     active = dr.full(mi.Bool, True, vertices.count)
     vertex = vertices.at(dr.arange(mi.UInt32, vertices.count), active)
     si = vertex.si

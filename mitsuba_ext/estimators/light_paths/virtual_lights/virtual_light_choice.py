@@ -112,7 +112,7 @@ class LearnedChoice:
         self._ranges, self._place, self._slot_count, self._order = (
             from_numpy(mi.UInt32, x) for x in words
         )
-        self._share = dr.opaque(mi.Float, 1 / len(vertices.first))
+        self._share = dr.opaque(mi.Float, 1 / vertices.paths)
 
     def numbers(self, sampler):
         return sampler.next_2d(), sampler.next_2d()
@@ -135,11 +135,7 @@ def _measured(lights: VirtualLights) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """The flux that each virtual light emits (:func:`emitted_flux`); the brightness of what it
     receives; and its region, 0 where there are no regions."""
     vertices = lights.vertices
-    # Rounded up, so that passes share a recording
-    index = dr.arange(mi.UInt32, vertices.room)
-    active = index < dr.opaque(mi.UInt32, vertices.count)
-    dr.eval(index, active)
-    found = (x.numpy()[: vertices.count] for x in _evaluated(lights.scene, vertices, index, active))
+    found = (x.numpy()[: vertices.count] for x in _evaluated(lights.scene, vertices))
     flux, brightness, region = found
     return flux.astype(np.float64), brightness.astype(np.float64), region
 
@@ -152,9 +148,10 @@ def emitted_flux(lights: VirtualLights) -> np.ndarray:
 
 @frozen
 def _evaluated(
-    scene: mi.Scene, vertices: VertexCache, index: mi.UInt32, active: mi.Bool
+    scene: mi.Scene, vertices: VertexCache
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     # ``scene`` holds the BSDFs that are called
+    index, active = vertices.every()
     vertex = vertices.at(index, active)
     si = vertex.si
     along_normal = mi.Vector3f(0, 0, dr.select(si.wi.z < 0, mi.Float(-1), 1))

@@ -93,13 +93,11 @@ class PictureOfLights:
         total = dr.zeros(mi.Spectrum, dr.width(rays.ray))
         if self._sensor is None or lights is None:
             return total
-        paths = len(lights.vertices.first) / self._pixels
+        paths = lights.vertices.paths / self._pixels
         image = LightImage(
             scene, self._sensor, numbers, rays, query=walk.query, light_paths=paths
         )
-        image.add(lights.vertices)
-        for splats in image.splats():
-            self._add(total, splats, rays)
+        self._add(total, image.splats(lights.vertices), rays)
         dr.eval(total)
         return total
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ....transport.estimator import CameraRays
 from ....transport.numbers import Numbers
 from ..light_numbers import LightPathRays, light_numbers
-from ..light_vertices import LightVertices, PackedVertices, VertexCache
+from ..light_vertices import VertexCache
 from ..light_walk import LightWalk
 
 #: The most light paths of a pass, and its least number of samples for each, beyond the first set.
@@ -78,10 +78,9 @@ class VirtualLights:
         self.share = dr.opaque(mi.Float, 1 / paths)
         first = dr.arange(mi.UInt32, set_count) * dr.opaque(mi.UInt32, paths)
         last = first + dr.opaque(mi.UInt32, paths - 1)
-        self.begin = dr.gather(mi.UInt32, vertices.first, first)
-        end = dr.gather(mi.UInt32, vertices.first, last)
-        end += dr.gather(mi.UInt32, vertices.number, last)
-        self.number = end - self.begin
+        self.begin = dr.gather(mi.UInt32, vertices.end, first)
+        self.begin -= dr.gather(mi.UInt32, vertices.number, first)
+        self.number = dr.gather(mi.UInt32, vertices.end, last) - self.begin
         dr.eval(self.begin, self.number)
 
     @classmethod
@@ -103,11 +102,9 @@ class VirtualLights:
             # Nothing moves: any time is as good as another
             time = dr.gather(mi.Float, time, mi.UInt32(0))
         light = LightPathRays(count, numbers, time, rays.ray.wavelengths)
-        rounds: list[LightVertices] = []
-        scatter_count = walk.run(
-            scene, light.numbers, light.time, light.wavelengths, dr.full(mi.Bool, True, count),
-            lambda vertices: rounds.append(PackedVertices(vertices)),
-        )  # fmt: skip
-        if not rounds:
+        vertices, scatter_count = walk.run(
+            scene, light.numbers, light.time, light.wavelengths, dr.full(mi.Bool, True, count)
+        )
+        if vertices is None:
             return None, scatter_count
-        return cls(scene, VertexCache(rounds, count), set_count, paths), scatter_count
+        return cls(scene, vertices, set_count, paths), scatter_count

@@ -14,7 +14,7 @@ import pytest
 from mitsuba_ext.estimators.light_paths.merging import merging_parameters
 from mitsuba_ext.estimators.light_paths.merging.merging import median_footprint
 from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
-from mitsuba_ext.estimators.light_paths.merging.vertex_grid import VertexGrid
+from mitsuba_ext.estimators.light_paths.merging.vertex_grid import VertexCounts, VertexGrid
 from mitsuba_ext.transport.scene_query import SceneQuery
 from tests.support.stage import film, stage
 
@@ -41,6 +41,10 @@ class Points:
     @property
     def room(self) -> int:
         return self.count + 5
+
+    def every(self) -> tuple[mi.UInt32, mi.Bool]:
+        index = dr.arange(mi.UInt32, self.room)
+        return index, index < self.count
 
     def position(self, index: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         columns = (mi.Float(column.tolist()) for column in self.p.T)
@@ -72,7 +76,7 @@ def test_the_grid_finds_each_point_within_the_radius_once(scale: float, radius: 
     clear = (abs(distance - radius) > 1e-5 * radius).all(axis=1)
     assert (count.numpy() == near.sum(axis=1))[clear].all() and near[clear].any()
     assert (total.numpy() == (near * np.arange(300) ** 2).sum(axis=1))[clear].all()
-    assert grid.count == 300
+    assert VertexCounts(Points(points), dr.opaque(mi.Float, radius), None).count == 300
 
 
 # ---- The radius ----

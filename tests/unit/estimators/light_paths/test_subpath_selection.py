@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from mitsuba_ext.estimators.light_paths.bidirectional_programs import LightSums
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
-from mitsuba_ext.estimators.light_paths.light_vertices import PackedVertices, VertexCache
+from mitsuba_ext.estimators.light_paths.light_vertices import VertexCache
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
 from mitsuba_ext.estimators.light_paths.subpath_choice.region_table import RegionTable
@@ -160,11 +160,8 @@ def _table_and_vertices(adversarial: bool) -> tuple[RegionTable, VertexCache]:
     def vertices(selection: RegionTable | None) -> VertexCache:
         program = LightSums(PartialSums(selection=selection), EmitterSampling())
         walk = LightWalk(LightEmission(scene), 5, 5, program)
-        rounds: list[PackedVertices] = []
-        walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths,
-                 dr.full(mi.Bool, True, lanes),
-                 lambda vertices: rounds.append(PackedVertices(vertices)))  # fmt: skip
-        return VertexCache(rounds, lanes)
+        active = dr.full(mi.Bool, True, lanes)
+        return walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, active)[0]
 
     some_vertices = vertices(None)
     active = dr.full(mi.Bool, True, some_vertices.count)
@@ -195,7 +192,7 @@ def test_vertices_are_chosen_as_often_as_their_weights_say(adversarial: bool) ->
     pairs = [mi.Point2f(numbers.next_float32(), numbers.next_float32()) for _ in range(2)]
     chosen = choice.choose(tuple(pairs), vertex, mi.Bool(True))
     index, active = chosen.index.numpy(), chosen.active.numpy()
-    lanes = len(vertices.first)
+    lanes = vertices.paths
     probability = 1 / (chosen.factor.numpy() * lanes)
     each = np.zeros(vertices.count)
     each[index[active]] = probability[active]
