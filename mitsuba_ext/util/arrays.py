@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -70,25 +70,36 @@ def joined(parts: Sequence[T]) -> T:
         dr.make_opaque(parts[0])
         return parts[0]
     widths = [dr.width(part) for part in parts]
-    indices, offset = [], 0
-    for width in widths:
-        indices.append(dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, offset))
+    results = [dr.empty(type(column), sum(widths)) for column in _columns(parts[0])]
+    offset = 0
+    for part, width in zip(parts, widths):
+        index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, offset)
+        for result, column in zip(results, _columns(part)):
+            dr.scatter(result, column, index)
+        # One kernel for all columns: the next part would evaluate each of them separately
+        dr.eval(results)
         offset += width
-    result = _joined(parts, indices, offset)
-    dr.eval(result)
-    return result
+    return _of_columns(parts[0], iter(results))
 
 
-def _joined(parts: Sequence[Any], indices: Sequence[mi.UInt32], width: int) -> Any:
-    kind = type(parts[0])
-    if parts[0] is None:
+def _columns(part: Any) -> list[Any]:
+    """The flat arrays in a part."""
+    if part is None:
+        return []
+    if is_dataclass(part):
+        part = [getattr(part, field.name) for field in fields(part)]
+    elif dr.depth_v(part) == 1:
+        return [part]
+    return [column for x in part for column in _columns(x)]
+
+
+def _of_columns(part: Any, columns: Iterator[Any]) -> Any:
+    """An object like ``part`` with these flat arrays."""
+    if part is None:
         return None
+    kind = type(part)
     if is_dataclass(kind):
-        columns = ([getattr(part, field.name) for part in parts] for field in fields(kind))
-        return kind(*(_joined(column, indices, width) for column in columns))
+        return kind(*(_of_columns(getattr(part, field.name), columns) for field in fields(kind)))
     if dr.depth_v(kind) > 1:
-        return kind(*(_joined(column, indices, width) for column in zip(*parts)))
-    result = dr.empty(kind, width)
-    for part, index in zip(parts, indices):
-        dr.scatter(result, part, index)
-    return result
+        return kind(*(_of_columns(x, columns) for x in part))
+    return next(columns)
