@@ -19,8 +19,7 @@ _STORED = 4
 #: The largest mean number of vertices of light paths, about, in scenes where they are long.
 _LONGEST = 32
 
-#: Bytes, about, of the state of a light path; of its vertices, as far as they are kept until the
-#: camera paths are traced; and of a camera path.
+#: Bytes, about, of the state of a light path; of its vertices without gaps; and of a camera path.
 _STATE, _KEPT, _CAMERA = 256, 256, 128
 
 
@@ -37,8 +36,8 @@ def bytes_of_photons(light_paths: float, max_depth: int) -> SampleBytes:
 
 
 def bytes_of_connected_path() -> SampleBytes:
-    """A light path whose vertices are connected to the sensor, and not kept."""
-    return SampleBytes(_STORED * _vertex(StoredHistory()) + _STATE)
+    """A light path whose vertices are connected to the sensor, round by round."""
+    return SampleBytes(_STORED * _vertex(StoredHistory()) + _STATE + _KEPT)
 
 
 def _light_path(history: StoredHistory, max_depth: int) -> SampleBytes:
