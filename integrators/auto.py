@@ -91,9 +91,10 @@ class Auto(LightPathIntegrator):
     in renders of less than a million samples, it has as few as 4096. If light paths reduce the
     variance to less than 0.4 of its value, the samples before the trial are left out of the image.
 
-    With fewer than 262144 samples, the integrator skips learning and renders as :monosp:`path`
-    does, unless it saves or keeps what it learns. Learning, and compiling the kernels that it
-    needs, would take longer than rendering all samples. :monosp:`statistics.learned` then says so.
+    With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
+    the integrator skips learning and renders as :monosp:`path` does, unless it saves or keeps what
+    it learns. Learning, and compiling the kernels that it needs, would take longer than rendering
+    all samples. :monosp:`statistics.learned` then says so.
     The shorter a render is, the more light paths must gain: 1.1 times the efficiency of everything
     else that was learned, and twice that efficiency in renders of half a million samples. With a
     :monosp:`timeout`, light paths are tried only if there is time to compile their kernels.
@@ -170,11 +171,12 @@ class Auto(LightPathIntegrator):
     def plan_learning(self, request, spp, kernels=math.inf):
         scene, film = request.scene, request.sensor.film()
         pixel_count = math.prod(film_extent(film))
-        is_short = pixel_count * spp < verdicts.LEAST_SAMPLES
+        least = self._least_samples()
+        is_short = pixel_count * spp < least
         is_short &= not (self.target_of(request) or self.keep_learned)
         plan = super().plan_learning(request, 0 if is_short else spp, kernels)
         if is_short and plan.restore is None:
-            remark = f"nothing: with fewer than {verdicts.LEAST_SAMPLES} samples, it is path"
+            remark = f"nothing: with fewer than {least} samples, it is path"
             plan = replace(plan, remark=remark)
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
@@ -206,8 +208,11 @@ class Auto(LightPathIntegrator):
         return choice.estimator(self.walk(decisions, observer), mapper)
 
     def parameters(self):
-        learns_from = f"{verdicts.LEAST_SAMPLES} samples (with fewer, it is path)"
+        learns_from = f"{self._least_samples()} samples (with fewer, it is path)"
         return {**super().parameters(), "learns_from": learns_from}
+
+    def _least_samples(self) -> int:
+        return verdicts.least_samples(device_of(mi.Float).is_gpu)
 
     def merging_radius(self, request, side, *sums):
         return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None

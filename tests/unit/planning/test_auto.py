@@ -82,7 +82,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
-    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
         auto().render(scene, spp=32, seed=1)
@@ -149,7 +149,7 @@ def test_short_renders_learn_nothing() -> None:
 def test_auto_equals_auto_path_where_light_paths_cannot_be_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     scene = mi.load_dict(fog("area"))
     images = []
     for name in ("auto", "auto_path"):

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     monkeypatch.setattr(photon_trial, "_LEAST", 1 << 14)
     monkeypatch.setattr(photon_trial, "_SAMPLES", 1 << 11)
 
