@@ -12,7 +12,7 @@ from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
-from .tree_builder import UNIFORM, Samples, TreeBuilder
+from .tree_builder import Cells, Nodes, grown
 
 #: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
 _PRIOR = 32
@@ -76,32 +76,21 @@ class SurfaceRegions:
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
 
-    def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
+    def build(self, records: PathRecords) -> tuple[Nodes, mi.UInt32, None]:
         """Builds the trees.
 
         Returns:
-            The builder, the root of each region's tree, and ``None``: leaves do not lead to other
+            The nodes, the root of each region's tree, and ``None``: leaves do not lead to other
             trees. The tree of the surrounding region is the prior of a region's tree.
         """
-        levels = list(enumerate(self._regions.levels))
-        samples, of_level = Samples(records.code, records.value, records.weight), []
-        region = records.region
-        for level, _regions in reversed(levels):
-            # Coarser levels merge what finer ones have merged
-            around = dr.gather(mi.UInt32, mi.UInt32(self._around(level)), region)
-            samples = samples.in_order(around).merged()
-            region = samples.tree
-            of_level.insert(0, samples)
-        builder = TreeBuilder()
-        roots = np.full(self.count + 1, UNIFORM, np.uint32)
-        for (level, regions), samples in zip(levels, of_level):
-            size = regions.stop - regions.start
-            if size == 0:
-                continue
-            expected = mi.UInt32(roots[self._regions.parent[regions]]) if level > 0 else None
-            first = builder.add_sorted(samples, regions.start, size, expected)
-            roots[regions] = first + np.arange(size)
-        return builder, mi.UInt32(roots), None
+        parent = self._parents()
+        levels, tree = self._regions.levels, records.region
+        cells = Cells.of(records.code, records.value, records.weight, tree, parent, levels)
+        return grown(cells, parent, levels), dr.arange(mi.UInt32, self.count + 1), None
+
+    def _parents(self) -> mi.UInt32:
+        """For each region, the one around it; mirrors and glass have none."""
+        return from_numpy(mi.UInt32, np.append(self._regions.parent, self.count))
 
     def incident_radiance(self, records: PathRecords) -> mi.Float:
         """The mean radiance that bounces find in each region; the surrounding region is the prior.

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from ...rendering.film_tiles import FilmTiles
-from ...util.arrays import joined
+from ...util.arrays import from_numpy, joined
 from ...util.stored_arrays import StoredArrays
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
-from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder
+from .tree_builder import DEPTH, Cells, Nodes, grown
 
 #: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.
 _GROUPS = (8, 4, 2, 1)
@@ -74,18 +74,19 @@ class TileRegions:
         """The tile under which a sample is recorded."""
         return self.begin(pixel)
 
-    def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, mi.UInt32]:
+    def build(self, records: PathRecords) -> tuple[Nodes, mi.UInt32, mi.UInt32]:
         """Builds the trees.
 
         The prior of a tile's tree is the tree of the larger tile around it. The prior of a tree
         below a leaf is the tree of all samples of its bounce in the tile.
 
         Returns:
-            The builder, the roots, and for each leaf the tree below it.
+            The nodes, the roots, and for each leaf the tree below it.
         """
-        builder = TreeBuilder()
-        # The tiles' trees are followed by one without splits, for leaves that no path has reached
-        roots, below, tree_count = [], [dr.full(mi.UInt32, self.count, 1)], self.count + 1
+        # A bounce after the first has trees for all tiles, followed by the trees below leaves
+        around, levels = self._larger_tiles()
+        first_tile, first_below = levels[-1].start, levels[-1].stop
+        nodes = None
         for bounce in range(records.bounces):
             chosen = dr.compress(records.bounce == bounce)
             if len(chosen) == 0:
@@ -96,57 +97,63 @@ class TileRegions:
                     records.code, records.value, records.weight, records.region, records.history
                 )
             )
-            samples = Samples(code, value, weight)
-            tiles = self._add_tiles(builder, samples, tile)
+            tile_tree = tile + dr.opaque(mi.UInt32, first_tile)
+            parent = from_numpy(mi.UInt32, around)
+            cells = Cells.of(code, value, weight, tile_tree, parent, levels)
             if bounce == 0:
-                roots += [tiles, dr.full(mi.UInt32, UNIFORM, 1)]
-                below.append(dr.full(mi.UInt32, self.count, builder.node_count - 1))
+                # The tiles' trees are followed by one without splits, for leaves that no path has
+                # reached
+                nodes = grown(cells, from_numpy(mi.UInt32, np.append(around, first_below)), levels)
+                roots = dr.arange(mi.UInt32, self.count + 1) + dr.opaque(mi.UInt32, first_tile)
+                below = dr.full(mi.UInt32, self.count, nodes.count)
                 continue
-            all_roots, all_below = joined(roots), joined(below)
             tree = tile
             for earlier in range(bounce):
                 cell = (history >> (DEPTH * (bounce - 1 - earlier))) & ((1 << DEPTH) - 1)
-                leaf = builder.leaf(dr.gather(mi.UInt32, all_roots, tree), cell)
-                tree = dr.gather(mi.UInt32, all_below, leaf)
+                leaf = nodes.leaf(dr.gather(mi.UInt32, roots, tree), cell)
+                tree = dr.gather(mi.UInt32, below, leaf)
             # Number the leaves that were reached
-            is_reached = dr.zeros(mi.UInt32, len(all_below))
+            is_reached = dr.zeros(mi.UInt32, nodes.count)
             dr.scatter(is_reached, mi.UInt32(1), leaf)
             leaves = dr.compress(is_reached > 0)
-            number = dr.zeros(mi.UInt32, len(all_below))
-            dr.scatter(number, dr.arange(mi.UInt32, len(leaves)), leaves)
+            new = dr.arange(mi.UInt32, len(leaves))
+            number = dr.zeros(mi.UInt32, nodes.count)
+            dr.scatter(number, new, leaves)
             number = dr.gather(mi.UInt32, number, leaf)
             # Neighbouring tiles can share a leaf: either of them can give the prior
             expected = dr.zeros(mi.UInt32, len(leaves))
-            dr.scatter_reduce(
-                dr.ReduceOp.Max, expected, dr.gather(mi.UInt32, tiles, tile), number
-            )
-            first = builder.add(samples, number, len(leaves), expected)
-            roots.append(dr.arange(mi.UInt32, len(leaves)) + dr.opaque(mi.UInt32, first))
-            first_tree = dr.opaque(mi.UInt32, tree_count)
-            dr.scatter(all_below, first_tree + dr.arange(mi.UInt32, len(leaves)), leaves)
-            new_nodes = builder.node_count - len(all_below)
-            below = [all_below, dr.full(mi.UInt32, self.count, new_nodes)]
-            tree_count += len(leaves)
-        return builder, joined(roots), joined(below)
+            dr.scatter_reduce(dr.ReduceOp.Max, expected, tile_tree, number)
+            below_tree = number + dr.opaque(mi.UInt32, first_below)
+            cells = joined([cells, Cells.of(code, value, weight, below_tree)])
+            last = dr.opaque(mi.UInt32, first_below + len(leaves), 1)
+            grown_nodes = grown(cells, joined([parent, expected, last]), levels)
+            dr.scatter(below, new + dr.opaque(mi.UInt32, len(roots)), leaves)
+            below = joined([below, dr.full(mi.UInt32, self.count, grown_nodes.count)])
+            first_root = dr.opaque(mi.UInt32, nodes.count + first_below)
+            roots = joined([roots, new + first_root])
+            nodes = nodes.followed_by(grown_nodes)
+        return nodes, roots, below
 
-    def _add_tiles(self, builder: TreeBuilder, samples: Samples, tile: mi.UInt32) -> mi.UInt32:
-        """Adds the trees of all tiles, large tiles first; returns the roots of the small
-        ones."""
+    def _larger_tiles(self) -> tuple[np.ndarray, list[slice]]:
+        """Numbers the tiles of all sizes, large ones first.
+
+        Returns:
+            For each tile, the larger tile around it (itself if there is none), and the tiles of
+            each size.
+        """
         row, column = np.divmod(np.arange(self.count, dtype=np.uint32), self._tiles.columns)
-        number, roots = np.zeros(self.count, np.uint32), None
+        around, levels, larger = [], [], None
         for group in _GROUPS:
             across = -(-self._tiles.columns // group)
-            new = (row // group * across + column // group).astype(np.uint32)
-            size = int(new[-1]) + 1
-            if roots is not None:
-                # The root of the larger tile around each of the new ones
-                around = np.zeros(size, np.uint32)
-                around[new] = number
-                roots = dr.gather(mi.UInt32, roots, mi.UInt32(around))
-            first = builder.add(samples, dr.gather(mi.UInt32, mi.UInt32(new), tile), size, roots)
-            roots = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, first)
-            number = new
-        return roots
+            start = levels[-1].stop if levels else 0
+            number = start + row // group * across + column // group
+            levels.append(slice(start, int(number[-1]) + 1))
+            parent = np.arange(start, levels[-1].stop)
+            if larger is not None:
+                parent[number - start] = larger
+            around.append(parent)
+            larger = number
+        return np.concatenate(around), levels
 
     def __str__(self) -> str:
         return f"{self.count} tiles of the film"

@@ -1,4 +1,4 @@
-"""Builds k-d trees over primary samples from the contributions of paths, all trees at once.
+"""Grows k-d trees over primary samples from the contributions of paths, all trees at once.
 
 The target density of a tree is proportional to the mean contribution of the samples. (The root of
 the mean square would give the least variance, but squares of contributions are too noisy to be
@@ -12,7 +12,9 @@ Source: Guo, PhD thesis, section 2.3.4 (mid-point splits, axes in turn); the est
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,9 +22,6 @@ import mitsuba as mi
 from ...util.arrays import joined
 from ...util.discrete_sampling import first_above
 from .sample_trees import LEAF
-
-#: The node of a tree without a split.
-UNIFORM = 0
 
 #: The most splits from the root of a tree to a leaf.
 DEPTH = 8
@@ -42,74 +41,314 @@ _UNITS = 2.0**20, 2.0**26, 2.0**20
 #: times the number of samples, which is less than 2⁶⁴ units.
 _LIMIT = 2.0**12
 
+#: In place of the number of a node.
+_NONE = 0xFFFFFFFF
 
-class Samples:
-    """Primary samples and the contributions of their paths.
 
-    Parameters:
-        code: The cell of each primary sample; see :func:`cell_code`.
-        value: Contribution of the path, divided by the density of the sample.
-        weight: 1 / density of the sample.
+@dataclass
+class Cells:
+    """The sums over the samples in each cell of some trees.
+
+    Attributes:
+        key: The number of the tree, followed by the bits of the cell. All cells of the first trees
+            come first; cells of other trees follow in increasing order if they have a sample.
+        value, square, weight: Sums of contributions, of their squares and of weights, in units.
     """
 
-    def __init__(self, code: mi.UInt32, value: mi.Float, weight: mi.Float) -> None:
-        self.code, self._value, self._weight = code, value, weight
+    key: mi.UInt32
+    value: mi.UInt64
+    square: mi.UInt64
+    weight: mi.UInt64
+
+    @property
+    def sums(self) -> list[mi.UInt64]:
+        """The three sums."""
+        return [self.value, self.square, self.weight]
+
+    @classmethod
+    def of(
+        cls,
+        code: mi.UInt32,
+        value: mi.Float,
+        weight: mi.Float,
+        tree: mi.UInt32,
+        parent: mi.UInt32 | None = None,
+        levels: Sequence[slice] = (slice(0, 0),),
+    ) -> Cells:
+        """The cells of primary samples, in their trees and in the trees of their surroundings.
+
+        Parameters:
+            code: The cell of each primary sample; see :func:`cell_code`.
+            value: Contribution of the path, divided by the density of the sample.
+            weight: 1 / density of the sample.
+            tree: The smallest tree to which the sample belongs.
+            parent: For each tree, the tree of its surroundings, which is of an earlier level.
+            levels: The trees of each level. All cells are stored for all levels except the last
+                one, where few cells of a tree have a sample.
+        """
         # In double precision, so that the order of the samples does not matter. Opaque: other
         # counts share the kernel
-        mean = dr.sum(mi.Float64(value)) / dr.opaque(mi.Float64, len(value))
-        self._scale = dr.rcp(dr.maximum(mean, 1e-30))
-
-    def in_order(self, tree: mi.UInt32) -> SortedSamples:
-        """The samples in the order of their trees, and of their cells in a tree."""
-        key = (tree << DEPTH) | self.code
+        count = dr.opaque(mi.UInt32, len(value))
+        scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / mi.Float64(count), 1e-30))
+        key = (tree << DEPTH) | code
         order = dr.argsort(key)
         key = dr.gather(mi.UInt32, key, order)
-        # One after the other: these are the largest arrays
-        return SortedSamples(key, [dr.cumsum(x) for x in self._fixed(order)])
-
-    def _fixed(self, order: mi.UInt32) -> Iterator[mi.UInt64]:
-        """Values, squares and weights in units, in another order."""
-        weight = dr.gather(mi.Float, self._weight, order)
         # The largest of n values is at most n times their mean
-        value = mi.Float64(dr.gather(mi.Float, self._value, order)) * self._scale
-        value = dr.minimum(value, _LIMIT)
-        for x, unit in zip((value, dr.square(value), mi.Float64(weight)), _UNITS):
-            yield mi.UInt64(x * unit)
+        value = dr.minimum(mi.Float64(dr.gather(mi.Float, value, order)) * scale, _LIMIT)
+        weight = mi.Float64(dr.gather(mi.Float, weight, order))
+        fixed = [mi.UInt64(x * y) for x, y in zip((value, dr.square(value), weight), _UNITS)]
+        # The last sample of each cell
+        index = dr.arange(mi.UInt32, len(key))
+        following = dr.gather(mi.UInt32, key, index + 1, index + 1 < count)
+        is_last = (index + 1 == count) | (key != following)
+        # Evaluated together: each of them alone would be a kernel of its own
+        dr.eval(key, fixed, is_last)
+        last = dr.compress(is_last)
+        cell = dr.arange(mi.UInt32, len(last))
+        begin = dr.select(cell > 0, dr.gather(mi.UInt32, last, cell - 1, cell > 0) + 1, 0)
+        sums = _between([dr.cumsum(x) for x in fixed], begin, last + 1)
+        key = dr.gather(mi.UInt32, key, last)
+        dr.eval(key, sums)
+
+        rows = levels[-1].start << DEPTH
+        cells = cls(dr.empty(mi.UInt32, rows + len(last)),
+                    *(dr.zeros(mi.UInt64, rows + len(last)) for _ in range(3)))  # fmt: skip
+        place = cell + dr.opaque(mi.UInt32, rows)
+        for target, x in zip((cells.key, *cells.sums), (key, *sums)):
+            _write(target, x, place)
+        if rows > 0:
+            cells._surround(key, sums, parent, levels)
+        return cells
+
+    def _surround(self, key, sums, parent: mi.UInt32, levels: Sequence[slice]) -> None:
+        """Adds to the cells of surroundings, from small ones to large ones."""
+        rows, trees = (dr.opaque(mi.UInt32, x) for x in (levels[-1].start, levels[-1].stop))
+
+        def around(key: mi.UInt32) -> mi.UInt32:
+            tree = dr.gather(mi.UInt32, parent, key >> DEPTH)
+            return (tree << DEPTH) | (key & ((1 << DEPTH) - 1))
+
+        def add(key: mi.UInt32, sums: list[mi.UInt64], active: mi.Bool) -> None:
+            for target, x in zip(self.sums, sums):
+                dr.scatter_add(target, x, key, active, mode=dr.ReduceMode.Direct)
+            dr.eval(self)
+
+        tree = key >> DEPTH
+        add(dr.select(tree < rows, key, around(key)), sums, tree < trees)
+        for level in reversed(levels[1:-1]):
+            key = dr.arange(mi.UInt32, (level.stop - level.start) << DEPTH)
+            key += dr.opaque(mi.UInt32, level.start << DEPTH)
+            sums = [dr.gather(mi.UInt64, x, key) for x in self.sums]
+            # Read before the table changes
+            dr.eval(sums)
+            add(around(key), sums, sums[2] > 0)
+        key = dr.arange(mi.UInt32, levels[-1].start << DEPTH)
+        _write(self.key, key, key)
 
 
-class SortedSamples(Samples):
-    """Samples in the order of :attr:`key`.
+@dataclass
+class Nodes:
+    """The nodes of trees. The first ones are the roots, in the order of the trees.
 
-    Parameters:
-        key: The number of the tree of each sample, followed by the bits of its cell.
-        running: Running sums of values, squares and weights, in units.
+    Attributes:
+        probability, child, is_even: The nodes, as parameters of :class:`SampleTrees`.
     """
 
-    def __init__(self, key: mi.UInt32, running: list[mi.UInt64]) -> None:
-        self.key, self.running = key, running
-        self.tree, self.code = key >> DEPTH, key & ((1 << DEPTH) - 1)
+    probability: mi.Float
+    child: mi.UInt32
+    is_even: mi.Bool
 
-    def merged(self) -> SortedSamples:
-        """One sample instead of all samples of the same tree and cell."""
-        index, count = dr.arange(mi.UInt32, len(self.key)), dr.opaque(mi.UInt32, len(self.key))
-        following = dr.gather(mi.UInt32, self.key, index + 1, index + 1 < count)
-        last = dr.compress((index + 1 == count) | (self.key != following))
-        key, running = dr.gather(mi.UInt32, self.key, last), [
-            dr.gather(mi.UInt64, x, last) for x in self.running
-        ]
-        dr.eval(key, running)
-        return SortedSamples(key, running)
+    @property
+    def count(self) -> int:
+        """Number of nodes."""
+        return len(self.child)
 
-    def _fixed(self, order):
-        return (sums([x], order, order + 1)[0] for x in self.running)
+    def followed_by(self, other: Nodes) -> Nodes:
+        """These nodes, then those of other trees."""
+        child = other.child + dr.opaque(mi.UInt32, self.count)
+        return joined([self, Nodes(other.probability, child, other.is_even)])
+
+    def leaf(self, root: mi.UInt32, code: mi.UInt32) -> mi.UInt32:
+        """The leaf, of the tree at ``root``, that contains a cell."""
+        node = mi.UInt32(root)
+        for depth in range(DEPTH):
+            is_inner = dr.gather(mi.Float, self.probability, node) >= 0
+            side = (code >> (DEPTH - 1 - depth)) & 1
+            node = dr.select(is_inner, dr.gather(mi.UInt32, self.child, node) + side, node)
+        return node
 
 
-def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
-    """The sums over [begin, end), from running sums."""
-    return [
-        dr.gather(mi.UInt64, x, end - 1, end > 0) - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
-        for x in running
-    ]
+def grown(cells: Cells, prior: mi.UInt32, levels: Sequence[slice]) -> Nodes:
+    """Grows trees.
+
+    Parameters:
+        cells: The samples, by tree and cell.
+        prior: For each tree, the tree of an earlier level that is its prior; its own number if
+            there is none. The last tree has no samples.
+        levels: The trees of each level, with all cells in all levels except the last one.
+    """
+    return _Growth(cells, prior, levels).nodes()
+
+
+class _Growth:
+    """The trees while they grow: the nodes of a depth are split together, whatever their tree."""
+
+    def __init__(self, cells: Cells, prior: mi.UInt32, levels: Sequence[slice]) -> None:
+        self._key, self._running = cells.key, [dr.cumsum(x) for x in cells.sums]
+        tree = dr.arange(mi.UInt32, len(prior))
+        rows, last, count = (
+            dr.opaque(mi.UInt32, x)
+            for x in (levels[-1].start, len(prior) - 1, len(cells.key))
+        )
+        # Few numbers of steps, so that fewer kernels are compiled
+        longest = 1 << 8 * -(-len(cells.key).bit_length() // 8)
+        begin = self._lower_bound(tree << DEPTH, rows << DEPTH, count, longest)
+        begin = dr.select(tree < rows, tree << DEPTH, begin)
+        dr.eval(begin)
+        end = dr.gather(mi.UInt32, begin, dr.minimum(tree + 1, last))
+        end = dr.select(tree < rows, (tree + 1) << DEPTH, end)
+        value, square, _weight = self._sums(begin, end)
+        roots = _Level(begin, end, tree << DEPTH, _evidence(value, square))
+        roots.twin = dr.select(prior == tree, _NONE, prior)
+        self._levels, self._chain = [roots], len(levels)
+        while len(self._levels) <= DEPTH:
+            level = self._levels[-1]
+            is_split = level.evidence >= _SPLIT
+            dr.eval(level.twin, is_split)
+            splits = dr.compress(is_split)
+            if len(splits) == 0:
+                break
+            self._levels.append(self._split(level, splits, len(self._levels)))
+
+    def _split(self, level: _Level, splits: mi.UInt32, depth: int) -> _Level:
+        """Splits some of the nodes of a level; left and right children alternate in the new one."""
+        begin, end, key = (
+            dr.gather(mi.UInt32, x, splits) for x in (level.begin, level.end, level.key)
+        )
+        middle_key = key | dr.opaque(mi.UInt32, 1 << (DEPTH - depth))
+        middle = self._lower_bound(middle_key, begin, end, 1 << DEPTH)
+        value_l, square_l, weight_l = self._sums(begin, middle)
+        value_r, square_r, weight_r = self._sums(middle, end)
+        mean_l, mean_r = value_l / dr.maximum(weight_l, 1), value_r / dr.maximum(weight_r, 1)
+        found = dr.select(mean_l + mean_r > 0, mean_l / (mean_l + mean_r), 0.5)
+        prior = level.source(dr.gather(mi.UInt32, level.twin, splits))
+        left, count = 2 * dr.arange(mi.UInt32, len(splits)), 2 * len(splits)
+        evidence = dr.gather(mi.Float, level.evidence, splits)
+        share = mi.Point2f(found * evidence, _PRIOR) / (evidence + _PRIOR)
+        new, around = _Level(*_empty(count, 3), dr.empty(mi.Float, count)), *_empty(count, 1)
+        evidence_l, evidence_r = _evidence(value_l, square_l), _evidence(value_r, square_r)
+        level.split(splits, left, share, prior)
+        for target, of_left, of_right in (
+            (new.begin, begin, middle), (new.end, middle, end), (new.key, key, middle_key),
+            (new.evidence, evidence_l, evidence_r), (around, prior, prior),
+        ):  # fmt: skip
+            _write(target, of_left, left)
+            _write(target, of_right, left + 1)
+        dr.eval(level.links, level.shares, new.begin, new.end, new.key, new.evidence, around)
+        has_twin = around != _NONE
+        side = dr.arange(mi.UInt32, new.count) & 1
+        twin = level.link(around, has_twin).x + side
+        new.twin = dr.select(has_twin, twin, _NONE)
+        return new
+
+    def nodes(self) -> Nodes:
+        """The nodes, without subtrees that change little."""
+        starts = [0]
+        for level in self._levels:
+            starts.append(starts[-1] + level.count)
+        nodes = Nodes(
+            dr.full(mi.Float, LEAF, starts[-1]),
+            dr.zeros(mi.UInt32, starts[-1]),
+            dr.zeros(mi.Bool, starts[-1]),
+        )
+        # Mean square of the density below each node, if it is one on average
+        below = None
+        for depth, level in reversed(list(enumerate(self._levels[:-1]))):
+            if below is None:
+                below = dr.full(mi.Float, 1, self._levels[depth + 1].count)
+                dr.make_opaque(below)
+            node = dr.arange(mi.UInt32, level.count)
+            # A node that is not split takes over the split of its twin
+            p, new, left = self._settled(level, level.source(node), below)
+            is_kept = new > 1 + _LEAST_CHANGE
+            place = node + dr.opaque(mi.UInt32, starts[depth])
+            dr.scatter(nodes.probability, p, place, is_kept)
+            dr.scatter(nodes.child, left + dr.opaque(mi.UInt32, starts[depth + 1]), place, is_kept)
+            dr.scatter(nodes.is_even, dr.opaque(mi.Bool, depth % 2 == 0), place)
+            below = dr.select(is_kept, new, 1)
+            dr.eval(below, nodes)
+        return nodes
+
+    def _settled(
+        self, level: _Level, node: mi.UInt32, below: mi.Float
+    ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+        """The probability, the mean square and the left child of a node that is split. The mean
+        square is 1 where there is none."""
+        # The node, the node that is its prior, the prior of this one etc.
+        links, shares = [], []
+        for _ in range(self._chain):
+            active = node != _NONE
+            link = level.link(node, active)
+            links.append((active, link.x))
+            shares.append(dr.gather(mi.Point2f, level.shares, node, active))
+            node = dr.select(active, link.y, _NONE)
+        p = mi.Float(0.5)
+        for (active, left), share in zip(reversed(links), reversed(shares)):
+            p = dr.fma(share.y, p, share.x)
+            # The mean squares of both halves
+            halves = dr.gather(mi.Point2f, below, left >> 1, active)
+            new = 2 * (dr.square(p) * halves.x + dr.square(1 - p) * halves.y)
+            new = dr.select(active, new, 1)
+            prior = p
+            # A prior that becomes a leaf expects equal shares
+            p = dr.select(new > 1 + _LEAST_CHANGE, p, 0.5)
+        return prior, new, left
+
+    def _lower_bound(self, key, first, last, longest: int) -> mi.UInt32:
+        """The first cell of [first, last) whose key is not below ``key``."""
+        return first_above(self._key, first, last, key, mi.Bool(True), longest, reaches=True)
+
+    def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
+        """The sums of values, squares and weights of the cells [begin, end)."""
+        found = _between(self._running, begin, end)
+        return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
+
+
+class _Level:
+    """The nodes of one depth, in the order of their trees: the ranges of their cells, their keys,
+    their effective sample sizes, and their twins: the nodes of the priors for the same cells."""
+
+    def __init__(self, begin, end, key, evidence) -> None:
+        self.begin, self.end, self.key, self.evidence = begin, end, key, evidence
+        dr.eval(begin, end, key, evidence)
+        self.count = len(begin)
+        self.twin = mi.UInt32()
+
+    def split(self, splits, first, share, prior) -> None:
+        """Splits nodes: sets their left child, the share of the left half among the samples and
+        the weight of the prior, and the node that is the prior."""
+        # The other nodes are never read
+        self.links, self.shares = dr.empty(mi.UInt32, 2 * self.count), dr.empty(mi.Float, 2 * self.count)
+        for index, (link, x) in enumerate(zip((first, prior), share)):
+            _write(self.links, link, 2 * splits + index)
+            _write(self.shares, x, 2 * splits + index)
+
+    def link(self, node: mi.UInt32, active: mi.Bool) -> mi.Vector2u:
+        """The left child of a node that is split, and the node that is its prior."""
+        return dr.gather(mi.Vector2u, self.links, node, active)
+
+    @dr.syntax
+    def source(self, node: mi.UInt32) -> mi.UInt32:
+        """The node whose split a node has: itself, or the next one among its twins, twins of these
+        etc. that is split."""
+        node = mi.UInt32(node)
+        active = node != _NONE
+        while active:
+            is_split = dr.gather(mi.Float, self.evidence, node) >= _SPLIT
+            if ~is_split:
+                node = dr.gather(mi.UInt32, self.twin, node)
+            active = ~is_split & (node != _NONE)
+        return node
 
 
 def cell_code(u: mi.Point2f) -> mi.UInt32:
@@ -132,177 +371,26 @@ def cell_centre(code: mi.UInt32) -> mi.Point2f:
     return u
 
 
-class TreeBuilder:
-    """Builds trees, one forest after the other; later ones may refer to earlier ones.
-
-    Attributes:
-        probability, child, is_even: The nodes, as parameters of :class:`SampleTrees`.
-    """
-
-    def __init__(self) -> None:
-        self.probability, self.child, self.is_even = mi.Float(LEAF), mi.UInt32(0), mi.Bool(True)
-        # Mean square of the density below each node, if it is one on average
-        self._square = mi.Float(1)
-
-    @property
-    def node_count(self) -> int:
-        return len(self.child)
-
-    def add(
-        self,
-        samples: Samples,
-        tree: mi.UInt32,
-        tree_count: int,
-        expected: mi.UInt32 | None = None,
-    ) -> int:
-        """Adds ``tree_count`` trees.
-
-        Parameters:
-            samples: The samples from which the trees are built, and possibly others.
-            tree: The tree to which each sample belongs; ``tree_count`` or more for none.
-            expected: For each tree, the root of the earlier tree that is its prior.
-
-        Returns:
-            The node of the first tree; the nodes of the others follow.
-        """
-        most = dr.opaque(mi.UInt32, tree_count)
-        return self.add_sorted(samples.in_order(dr.minimum(tree, most)), 0, tree_count, expected)
-
-    def add_sorted(
-        self,
-        samples: SortedSamples,
-        first: int,
-        tree_count: int,
-        expected: mi.UInt32 | None = None,
-    ) -> int:
-        """As :meth:`add`, for samples that have been sorted. The trees have the numbers
-        from ``first`` on."""
-        first_node, self._sorted = self.node_count, samples
-        tree = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, tree_count)
-        begin, end = self._lower_bound(tree << DEPTH), self._lower_bound((tree + 1) << DEPTH)
-        twin = dr.full(mi.UInt32, UNIFORM, tree_count) if expected is None else expected
-        value, square, _weight = self._sums(begin, end)
-        levels = [_Level(begin, end, tree << DEPTH, twin, _evidence(value, square))]
-        while len(levels) <= DEPTH:
-            level = levels[-1]
-            splits = dr.compress(level.evidence >= _SPLIT)
-            if len(splits) == 0:
-                break
-            level.first_child = first_node + sum(x.count for x in levels)
-            levels.append(self._split(level, splits, len(levels)))
-        self._append(levels)
-        return first_node
-
-    def leaf(self, root: mi.UInt32, code: mi.UInt32) -> mi.UInt32:
-        """The leaf, of the tree at ``root``, that contains a cell."""
-        node = mi.UInt32(root)
-        for depth in range(DEPTH):
-            is_inner = dr.gather(mi.Float, self.probability, node) >= 0
-            side = (code >> (DEPTH - 1 - depth)) & 1
-            node = dr.select(is_inner, dr.gather(mi.UInt32, self.child, node) + side, node)
-        return node
-
-    def _split(self, level: _Level, splits: mi.UInt32, depth: int) -> _Level:
-        """Splits some of the nodes of a level; left and right children alternate in the new one."""
-        begin, end, code, twin = (
-            dr.gather(mi.UInt32, x, splits)
-            for x in (level.begin, level.end, level.code, level.twin)
-        )
-        middle_code = code | dr.opaque(mi.UInt32, 1 << (DEPTH - depth))
-        middle = self._lower_bound(middle_code, begin, end)
-        value_l, square_l, weight_l = self._sums(begin, middle)
-        value_r, square_r, weight_r = self._sums(middle, end)
-        evidence_l, evidence_r = _evidence(value_l, square_l), _evidence(value_r, square_r)
-        evidence = dr.gather(mi.Float, level.evidence, splits)
-        mean_l, mean_r = value_l / dr.maximum(weight_l, 1), value_r / dr.maximum(weight_r, 1)
-        found = dr.select(mean_l + mean_r > 0, mean_l / (mean_l + mean_r), 0.5)
-        expected = dr.gather(mi.Float, self.probability, twin)
-        has_twins = expected >= 0
-        expected = dr.select(has_twins, expected, 0.5)
-        twins = dr.gather(mi.UInt32, self.child, twin, has_twins)
-        level.splits = splits
-        level.probability = (evidence * found + _PRIOR * expected) / (evidence + _PRIOR)
-        twin_l, twin_r = (dr.select(has_twins, x, twin) for x in (twins, twins + 1))
-        # Evaluated together: each of them alone would be a kernel of its own
-        dr.eval(
-            begin, middle, end, code, middle_code, twin_l, twin_r, evidence_l, evidence_r,
-            level.probability,
-        )
-        return _Level(
-            _alternate(begin, middle),
-            _alternate(middle, end),
-            _alternate(code, middle_code),
-            _alternate(twin_l, twin_r),
-            _alternate(evidence_l, evidence_r),
-        )
-
-    def _lower_bound(self, code, first=None, last=None) -> mi.UInt32:
-        """The first sample whose code is not below ``code``."""
-        key = self._sorted.key
-        if first is None:
-            first, last = mi.UInt32(0), dr.opaque(mi.UInt32, len(key))
-        # Few numbers of steps, so that fewer kernels are compiled
-        longest = 1 << 8 * -(-len(key).bit_length() // 8)
-        return first_above(key, first, last, code, mi.Bool(True), longest, reaches=True)
-
-    def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
-        """The sums of values, squares and weights of the samples [begin, end)."""
-        found = sums(self._sorted.running, begin, end)
-        return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
-
-    def _append(self, levels: list[_Level]) -> None:
-        """Appends the nodes of the new trees, without the splits that hardly change the density."""
-        columns, below = [], None
-        for depth, level in reversed(list(enumerate(levels))):
-            # A node that is not split takes over the splits of its twin
-            probability = dr.gather(mi.Float, self.probability, level.twin)
-            child = dr.gather(mi.UInt32, self.child, level.twin)
-            square = dr.gather(mi.Float, self._square, level.twin)
-            dr.eval(probability, child, square)
-            if below is not None:
-                left = 2 * dr.arange(mi.UInt32, len(level.splits))
-                first_child = dr.opaque(mi.UInt32, level.first_child)
-                p = level.probability
-                new = 2 * (
-                    dr.square(p) * dr.gather(mi.Float, below, left)
-                    + dr.square(1 - p) * dr.gather(mi.Float, below, left + 1)
-                )
-                is_kept = new > 1 + _LEAST_CHANGE
-                p, new = dr.select(is_kept, p, LEAF), dr.select(is_kept, new, 1)
-                dr.scatter(probability, p, level.splits)
-                dr.scatter(child, first_child + left, level.splits)
-                dr.scatter(square, new, level.splits)
-            dr.eval(probability, child, square)
-            below = square
-            is_even = dr.opaque(mi.Bool, depth % 2 == 0, level.count)
-            columns.append((probability, child, is_even, square))
-        old = self.probability, self.child, self.is_even, self._square
-        self.probability, self.child, self.is_even, self._square = (
-            joined([x, *reversed(new)]) for x, new in zip(old, zip(*columns))
-        )
+def _between(
+    running: Sequence[mi.UInt64], begin: mi.UInt32, end: mi.UInt32
+) -> list[mi.UInt64]:
+    """The sums over [begin, end), from running sums."""
+    return [
+        dr.gather(mi.UInt64, x, end - 1, end > 0) - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
+        for x in running
+    ]
 
 
-class _Level:
-    """The nodes of one depth: the range of their samples, their codes, and their twins, which are
-    the nodes of the priors for the same cells (or for cells around them)."""
+def _write(target: mi.UInt32 | mi.UInt64 | mi.Float, value: Any, place: mi.UInt32) -> None:
+    """Writes to places of which each is written once. (Otherwise, the second ``dr.scatter`` to an
+    array evaluates the first one.)"""
+    dr.scatter(target, value, place, mode=dr.ReduceMode.Permute)
 
-    def __init__(self, begin, end, code, twin, evidence) -> None:
-        self.begin, self.end, self.code, self.twin = begin, end, code, twin
-        self.evidence = evidence
-        # Opaque: levels without twins share the kernels of the others
-        dr.make_opaque(twin)
-        dr.eval(begin, end, code, twin, evidence)
-        self.count = len(begin)
-        self.first_child, self.splits, self.probability = 0, mi.UInt32(), mi.Float()
+
+def _empty(count: int, arrays: int) -> list[mi.UInt32]:
+    return [dr.empty(mi.UInt32, count) for _ in range(arrays)]
 
 
 def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:
     """The effective sample size: this number of samples of equal contribution is as uncertain."""
     return dr.select(square > 0, dr.square(value) / square, 0)
-
-
-def _alternate(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
-    """a₀, b₀, a₁, b₁, …"""
-    index = dr.arange(mi.UInt32, 2 * len(a))
-    half, array = index >> 1, type(a)
-    return dr.select((index & 1) == 1, dr.gather(array, b, half), dr.gather(array, a, half))
