@@ -215,11 +215,11 @@ class GuideLearner(Learner):
                 self.guide, self._records, self.roulette = None, None, Roulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return None
-        builder, roots, below = self._regions.build(records)
+        nodes, roots, below = self._regions.build(records)
         trees = SampleTrees(
-            builder.probability,
-            builder.child,
-            builder.is_even,
+            nodes.probability,
+            nodes.child,
+            nodes.is_even,
             roots,
             dr.full(mi.Float, share, len(roots)),
             below,

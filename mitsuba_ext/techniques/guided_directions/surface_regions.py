@@ -86,7 +86,8 @@ class SurfaceRegions:
         parent = self._parents()
         levels, tree = self._regions.levels, records.region
         cells = Cells.of(records.code, records.value, records.weight, tree, parent, levels)
-        return grown(cells, parent, levels), dr.arange(mi.UInt32, self.count + 1), None
+        nodes = grown(cells, parent, len(levels), levels[-1].start)
+        return nodes, dr.arange(mi.UInt32, self.count + 1), None
 
     def _parents(self) -> mi.UInt32:
         """For each region, the one around it; mirrors and glass have none."""

@@ -103,7 +103,8 @@ class TileRegions:
             if bounce == 0:
                 # The tiles' trees are followed by one without splits, for leaves that no path has
                 # reached
-                nodes = grown(cells, from_numpy(mi.UInt32, np.append(around, first_below)), levels)
+                prior = from_numpy(mi.UInt32, np.append(around, first_below))
+                nodes = grown(cells, prior, len(levels), first_tile)
                 roots = dr.arange(mi.UInt32, self.count + 1) + dr.opaque(mi.UInt32, first_tile)
                 below = dr.full(mi.UInt32, self.count, nodes.count)
                 continue
@@ -126,7 +127,8 @@ class TileRegions:
             below_tree = number + dr.opaque(mi.UInt32, first_below)
             cells = joined([cells, Cells.of(code, value, weight, below_tree)])
             last = dr.opaque(mi.UInt32, first_below + len(leaves), 1)
-            grown_nodes = grown(cells, joined([parent, expected, last]), levels)
+            prior = joined([parent, expected, last])
+            grown_nodes = grown(cells, prior, len(levels) + 1, first_tile)
             dr.scatter(below, new + dr.opaque(mi.UInt32, len(roots)), leaves)
             below = joined([below, dr.full(mi.UInt32, self.count, grown_nodes.count)])
             first_root = dr.opaque(mi.UInt32, nodes.count + first_below)

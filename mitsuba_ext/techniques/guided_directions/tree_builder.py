@@ -20,7 +20,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ...util.arrays import joined
-from ...util.discrete_sampling import first_above
 from .sample_trees import LEAF
 
 #: The most splits from the root of a tree to a leaf.
@@ -47,12 +46,13 @@ _NONE = 0xFFFFFFFF
 
 @dataclass
 class Cells:
-    """The sums over the samples in each cell of some trees.
+    """Running sums over the cells of some trees, from which the sums over a tree's cells follow.
 
     Attributes:
         key: The number of the tree, followed by the bits of the cell. All cells of the first trees
-            come first; cells of other trees follow in increasing order if they have a sample.
-        value, square, weight: Sums of contributions, of their squares and of weights, in units.
+            come first; cells of other trees follow in increasing order if they have a sample. An
+            entry before these has sums of zero.
+        value, square, weight: Of contributions, of their squares and of weights, in units.
     """
 
     key: mi.UInt32
@@ -62,7 +62,7 @@ class Cells:
 
     @property
     def sums(self) -> list[mi.UInt64]:
-        """The three sums."""
+        """The three running sums."""
         return [self.value, self.square, self.weight]
 
     @classmethod
@@ -103,47 +103,78 @@ class Cells:
         is_last = (index + 1 == count) | (key != following)
         # Evaluated together: each of them alone would be a kernel of its own
         dr.eval(key, fixed, is_last)
+        running = [dr.cumsum(x) for x in fixed]
         last = dr.compress(is_last)
-        cell = dr.arange(mi.UInt32, len(last))
-        begin = dr.select(cell > 0, dr.gather(mi.UInt32, last, cell - 1, cell > 0) + 1, 0)
-        sums = _between([dr.cumsum(x) for x in fixed], begin, last + 1)
-        key = dr.gather(mi.UInt32, key, last)
-        dr.eval(key, sums)
 
         rows = levels[-1].start << DEPTH
-        cells = cls(dr.empty(mi.UInt32, rows + len(last)),
-                    *(dr.zeros(mi.UInt64, rows + len(last)) for _ in range(3)))  # fmt: skip
+        size = rows + 1 + len(last)
+        cells = cls(*_empty(mi.UInt32, size, 1), *_empty(mi.UInt64, size, 3))
+        # One cell more, before the first one
+        cell = dr.arange(mi.UInt32, 1 + len(last))
+        is_cell = cell > 0
         place = cell + dr.opaque(mi.UInt32, rows)
-        for target, x in zip((cells.key, *cells.sums), (key, *sums)):
-            _write(target, x, place)
+        sample = dr.gather(mi.UInt32, last, cell - 1, is_cell)
+        for target, x in zip(cells.sums, running):
+            _write(target, dr.gather(mi.UInt64, x, sample, is_cell), place)
+        key = dr.gather(mi.UInt32, key, sample)
+        _write(cells.key, dr.select(is_cell, key, dr.maximum(key, 1) - 1), place)
+        dr.eval(cells)
         if rows > 0:
-            cells._surround(key, sums, parent, levels)
+            cells._surround(parent, levels)
         return cells
 
-    def _surround(self, key, sums, parent: mi.UInt32, levels: Sequence[slice]) -> None:
-        """Adds to the cells of surroundings, from small ones to large ones."""
+    @dr.syntax
+    def lower_bound(self, key: mi.UInt32, first: mi.UInt32, last: mi.UInt32) -> mi.UInt32:
+        """The first cell of [first, last) whose key is not below ``key``."""
+        first, last = mi.UInt32(first), mi.UInt32(last)
+        while first < last:
+            middle = (first + last) >> 1
+            is_below = dr.gather(mi.UInt32, self.key, middle) < key
+            first = dr.select(is_below, middle + 1, first)
+            last = dr.select(is_below, last, middle)
+        return first
+
+    def between(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
+        """The sums over [begin, end)."""
+        return [
+            dr.gather(mi.UInt64, x, end - 1, end > 0)
+            - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
+            for x in self.sums
+        ]
+
+    def _surround(self, parent: mi.UInt32, levels: Sequence[slice]) -> None:
+        """Sets the running sums of surroundings, from small ones to large ones."""
         rows, trees = (dr.opaque(mi.UInt32, x) for x in (levels[-1].start, levels[-1].stop))
+        count = levels[-1].start << DEPTH
+        table = [dr.zeros(mi.UInt64, count) for _ in range(3)]
 
         def around(key: mi.UInt32) -> mi.UInt32:
             tree = dr.gather(mi.UInt32, parent, key >> DEPTH)
             return (tree << DEPTH) | (key & ((1 << DEPTH) - 1))
 
         def add(key: mi.UInt32, sums: list[mi.UInt64], active: mi.Bool) -> None:
-            for target, x in zip(self.sums, sums):
+            for target, x in zip(table, sums):
                 dr.scatter_add(target, x, key, active, mode=dr.ReduceMode.Direct)
-            dr.eval(self)
+            dr.eval(table)
 
+        place = dr.arange(mi.UInt32, len(self.key) - count - 1) + (rows << DEPTH) + 1
+        key = dr.gather(mi.UInt32, self.key, place)
         tree = key >> DEPTH
-        add(dr.select(tree < rows, key, around(key)), sums, tree < trees)
+        key = dr.select(tree < rows, key, around(key))
+        add(key, self.between(place, place + 1), tree < trees)
         for level in reversed(levels[1:-1]):
+            if level.start == level.stop:
+                continue
             key = dr.arange(mi.UInt32, (level.stop - level.start) << DEPTH)
             key += dr.opaque(mi.UInt32, level.start << DEPTH)
-            sums = [dr.gather(mi.UInt64, x, key) for x in self.sums]
+            sums = [dr.gather(mi.UInt64, x, key) for x in table]
             # Read before the table changes
             dr.eval(sums)
             add(around(key), sums, sums[2] > 0)
-        key = dr.arange(mi.UInt32, levels[-1].start << DEPTH)
-        _write(self.key, key, key)
+        key = dr.arange(mi.UInt32, count)
+        for target, x in zip((self.key, *self.sums), (key, *(dr.cumsum(x) for x in table))):
+            _write(target, x, key)
+        dr.eval(self)
 
 
 @dataclass
@@ -178,39 +209,38 @@ class Nodes:
         return node
 
 
-def grown(cells: Cells, prior: mi.UInt32, levels: Sequence[slice]) -> Nodes:
+def grown(cells: Cells, prior: mi.UInt32, forests: int, whole: int = 0) -> Nodes:
     """Grows trees.
 
     Parameters:
         cells: The samples, by tree and cell.
-        prior: For each tree, the tree of an earlier level that is its prior; its own number if
-            there is none. The last tree has no samples.
-        levels: The trees of each level, with all cells in all levels except the last one.
+        prior: For each tree, the tree that is its prior; its own number if there is none. The last
+            tree has no samples.
+        forests: The most trees of which each is the prior of the next one.
+        whole: The number of trees that come first, with all their cells.
     """
-    return _Growth(cells, prior, levels).nodes()
+    return _Growth(cells, prior, forests, whole).nodes()
 
 
 class _Growth:
     """The trees while they grow: the nodes of a depth are split together, whatever their tree."""
 
-    def __init__(self, cells: Cells, prior: mi.UInt32, levels: Sequence[slice]) -> None:
-        self._key, self._running = cells.key, [dr.cumsum(x) for x in cells.sums]
+    def __init__(self, cells: Cells, prior: mi.UInt32, forests: int, whole: int) -> None:
+        self._cells, self._forests = cells, forests
         tree = dr.arange(mi.UInt32, len(prior))
-        rows, last, count = (
-            dr.opaque(mi.UInt32, x)
-            for x in (levels[-1].start, len(prior) - 1, len(cells.key))
+        whole, last, count = (
+            dr.opaque(mi.UInt32, x) for x in (whole, len(prior) - 1, len(cells.key))
         )
-        # Few numbers of steps, so that fewer kernels are compiled
-        longest = 1 << 8 * -(-len(cells.key).bit_length() // 8)
-        begin = self._lower_bound(tree << DEPTH, rows << DEPTH, count, longest)
-        begin = dr.select(tree < rows, tree << DEPTH, begin)
+        is_whole = tree < whole
+        begin = cells.lower_bound(tree << DEPTH, whole << DEPTH, count)
+        begin = dr.select(is_whole, tree << DEPTH, begin)
         dr.eval(begin)
         end = dr.gather(mi.UInt32, begin, dr.minimum(tree + 1, last))
-        end = dr.select(tree < rows, (tree + 1) << DEPTH, end)
+        end = dr.select(is_whole, (tree + 1) << DEPTH, end)
         value, square, _weight = self._sums(begin, end)
         roots = _Level(begin, end, tree << DEPTH, _evidence(value, square))
         roots.twin = dr.select(prior == tree, _NONE, prior)
-        self._levels, self._chain = [roots], len(levels)
+        self._levels = [roots]
         while len(self._levels) <= DEPTH:
             level = self._levels[-1]
             is_split = level.evidence >= _SPLIT
@@ -226,7 +256,7 @@ class _Growth:
             dr.gather(mi.UInt32, x, splits) for x in (level.begin, level.end, level.key)
         )
         middle_key = key | dr.opaque(mi.UInt32, 1 << (DEPTH - depth))
-        middle = self._lower_bound(middle_key, begin, end, 1 << DEPTH)
+        middle = self._cells.lower_bound(middle_key, begin, end)
         value_l, square_l, weight_l = self._sums(begin, middle)
         value_r, square_r, weight_r = self._sums(middle, end)
         mean_l, mean_r = value_l / dr.maximum(weight_l, 1), value_r / dr.maximum(weight_r, 1)
@@ -235,7 +265,8 @@ class _Growth:
         left, count = 2 * dr.arange(mi.UInt32, len(splits)), 2 * len(splits)
         evidence = dr.gather(mi.Float, level.evidence, splits)
         share = mi.Point2f(found * evidence, _PRIOR) / (evidence + _PRIOR)
-        new, around = _Level(*_empty(count, 3), dr.empty(mi.Float, count)), *_empty(count, 1)
+        new = _Level(*_empty(mi.UInt32, count, 3), dr.empty(mi.Float, count))
+        around = dr.empty(mi.UInt32, count)
         evidence_l, evidence_r = _evidence(value_l, square_l), _evidence(value_r, square_r)
         level.split(splits, left, share, prior)
         for target, of_left, of_right in (
@@ -261,6 +292,8 @@ class _Growth:
             dr.zeros(mi.UInt32, starts[-1]),
             dr.zeros(mi.Bool, starts[-1]),
         )
+        parities = [dr.opaque(mi.Bool, is_even) for is_even in (True, False)]
+        first_below = dr.opaque(mi.UInt32, starts[-2])
         # Mean square of the density below each node, if it is one on average
         below = None
         for depth, level in reversed(list(enumerate(self._levels[:-1]))):
@@ -271,11 +304,12 @@ class _Growth:
             # A node that is not split takes over the split of its twin
             p, new, left = self._settled(level, level.source(node), below)
             is_kept = new > 1 + _LEAST_CHANGE
-            place = node + dr.opaque(mi.UInt32, starts[depth])
+            first = dr.opaque(mi.UInt32, starts[depth])
+            place = node + first
             dr.scatter(nodes.probability, p, place, is_kept)
-            dr.scatter(nodes.child, left + dr.opaque(mi.UInt32, starts[depth + 1]), place, is_kept)
-            dr.scatter(nodes.is_even, dr.opaque(mi.Bool, depth % 2 == 0), place)
-            below = dr.select(is_kept, new, 1)
+            dr.scatter(nodes.child, left + first_below, place, is_kept)
+            dr.scatter(nodes.is_even, parities[depth % 2], place)
+            below, first_below = dr.select(is_kept, new, 1), first
             dr.eval(below, nodes)
         return nodes
 
@@ -286,7 +320,7 @@ class _Growth:
         square is 1 where there is none."""
         # The node, the node that is its prior, the prior of this one etc.
         links, shares = [], []
-        for _ in range(self._chain):
+        for _ in range(self._forests):
             active = node != _NONE
             link = level.link(node, active)
             links.append((active, link.x))
@@ -304,13 +338,9 @@ class _Growth:
             p = dr.select(new > 1 + _LEAST_CHANGE, p, 0.5)
         return prior, new, left
 
-    def _lower_bound(self, key, first, last, longest: int) -> mi.UInt32:
-        """The first cell of [first, last) whose key is not below ``key``."""
-        return first_above(self._key, first, last, key, mi.Bool(True), longest, reaches=True)
-
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
         """The sums of values, squares and weights of the cells [begin, end)."""
-        found = _between(self._running, begin, end)
+        found = self._cells.between(begin, end)
         return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
 
 
@@ -328,7 +358,8 @@ class _Level:
         """Splits nodes: sets their left child, the share of the left half among the samples and
         the weight of the prior, and the node that is the prior."""
         # The other nodes are never read
-        self.links, self.shares = dr.empty(mi.UInt32, 2 * self.count), dr.empty(mi.Float, 2 * self.count)
+        self.links = dr.empty(mi.UInt32, 2 * self.count)
+        self.shares = dr.empty(mi.Float, 2 * self.count)
         for index, (link, x) in enumerate(zip((first, prior), share)):
             _write(self.links, link, 2 * splits + index)
             _write(self.shares, x, 2 * splits + index)
@@ -371,24 +402,14 @@ def cell_centre(code: mi.UInt32) -> mi.Point2f:
     return u
 
 
-def _between(
-    running: Sequence[mi.UInt64], begin: mi.UInt32, end: mi.UInt32
-) -> list[mi.UInt64]:
-    """The sums over [begin, end), from running sums."""
-    return [
-        dr.gather(mi.UInt64, x, end - 1, end > 0) - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
-        for x in running
-    ]
-
-
 def _write(target: mi.UInt32 | mi.UInt64 | mi.Float, value: Any, place: mi.UInt32) -> None:
     """Writes to places of which each is written once. (Otherwise, the second ``dr.scatter`` to an
     array evaluates the first one.)"""
     dr.scatter(target, value, place, mode=dr.ReduceMode.Permute)
 
 
-def _empty(count: int, arrays: int) -> list[mi.UInt32]:
-    return [dr.empty(mi.UInt32, count) for _ in range(arrays)]
+def _empty(kind: type, count: int, arrays: int) -> list[Any]:
+    return [dr.empty(kind, count) for _ in range(arrays)]
 
 
 def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:

@@ -209,8 +209,8 @@ def test_mirrors_and_glass_neither_learn_nor_are_guided(surfaces: SurfaceRegions
     ones, spot = dr.full(mi.Float, 1, 20_000), dr.select(u.x < 0.25, mi.Float(9), 1)
     for label, is_guided in ((region, True), (mi.UInt32(specular[0]), False)):
         samples = SimpleNamespace(code=cell_code(u), value=spot, weight=ones, region=label)
-        builder, roots, _ = surfaces.build(samples)
-        probability = dr.gather(mi.Float, builder.probability, roots).numpy()
+        nodes, roots, _ = surfaces.build(samples)
+        probability = dr.gather(mi.Float, nodes.probability, roots).numpy()
         assert probability[-1] == LEAF and (probability[:-1] != LEAF).any() == is_guided
 
 
@@ -245,13 +245,13 @@ def test_a_region_without_samples_has_the_density_of_the_one_around_it(
     ones = dr.full(mi.Float, 1, p.shape[1])
     region = surfaces.label(_interaction(p, n), None, mi.Bool(True))
     value = dr.select((u.x < 0.25) & (u.y > 0.5), mi.Float(9), 1)
-    builder, roots, below = surfaces.build(
+    nodes, roots, below = surfaces.build(
         SimpleNamespace(code=cell_code(u), value=value, weight=ones, region=region)
     )
     assert below is None and len(roots) == surfaces.count + 1
-    assert roots.numpy().max() < builder.node_count
+    assert roots.numpy().max() < nodes.count
     share = dr.full(mi.Float, 0.6, len(roots))
-    trees = SampleTrees(builder.probability, builder.child, builder.is_even, roots, share)
+    trees = SampleTrees(nodes.probability, nodes.child, nodes.is_even, roots, share)
     # Of a region and all smaller ones in it
     count = np.bincount(region.numpy(), minlength=surfaces.count)
     for smaller in reversed(range(1, surfaces.count)):
@@ -306,11 +306,11 @@ def _tile_trees(width: int, height: int, tile: int) -> tuple[TileRegions, Sample
         history=twice(zero, first), bounce=twice(zero, zero + 1),
         value=mi.Float(np.tile(brought, 2)), weight=dr.full(mi.Float, 1, 2 * count),
     )  # fmt: skip
-    builder, roots, below = regions.build(records)
-    assert len(below) == builder.node_count and below.numpy().max() < len(roots)
+    nodes, roots, below = regions.build(records)
+    assert len(below) == nodes.count and below.numpy().max() < len(roots)
     share = dr.full(mi.Float, 0.8, len(roots))
     return regions, SampleTrees(
-        builder.probability, builder.child, builder.is_even, roots, share, below
+        nodes.probability, nodes.child, nodes.is_even, roots, share, below
     )
 
 
@@ -358,8 +358,8 @@ def _one_tile(u: np.ndarray, value: np.ndarray, goes_on: list[np.ndarray]) -> tu
         weight=dr.full(mi.Float, 1, len(code)),
     )  # fmt: skip
     regions, active = TileRegions(1, 1, 1), mi.Bool(True)
-    builder, roots, below = regions.build(records)
-    arrays = builder.probability, builder.child, builder.is_even, roots
+    nodes, roots, below = regions.build(records)
+    arrays = nodes.probability, nodes.child, nodes.is_even, roots
     trees = SampleTrees(*arrays, dr.full(mi.Float, 0.8, len(roots)), below)
 
     def after(*samples: float) -> tuple[int, float]:

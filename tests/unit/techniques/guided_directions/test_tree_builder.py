@@ -10,10 +10,11 @@ import pytest
 from mitsuba_ext.techniques.guided_directions.sample_trees import LEAF, SampleTrees
 from mitsuba_ext.techniques.guided_directions.tree_builder import (
     DEPTH,
-    Samples,
-    TreeBuilder,
+    Cells,
+    Nodes,
     cell_centre,
     cell_code,
+    grown,
 )  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -27,30 +28,30 @@ def _uniform(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((2, count), dtype=np.float32)
 
 
-def _samples(u, value, weight=1.0) -> Samples:
+def _samples(u, value, weight=1.0) -> tuple[mi.UInt32, mi.Float, mi.Float]:
     value, weight = (np.broadcast_to(x, u.shape[1]).astype(np.float32) for x in (value, weight))
-    return Samples(cell_code(mi.Point2f(u)), mi.Float(value), mi.Float(weight))
+    return cell_code(mi.Point2f(u)), mi.Float(value), mi.Float(weight)
 
 
-def _add(builder: TreeBuilder, samples: Samples, tree=0, count: int = 1, expected=None) -> int:
-    tree = np.broadcast_to(tree, len(samples.code)).astype(np.uint32)
-    return builder.add(samples, mi.UInt32(tree), count, expected)
+def _grown(samples, tree=0, count: int = 1, prior=()) -> Nodes:
+    """Trees, the first of which have a prior."""
+    tree = np.broadcast_to(tree, len(samples[0])).astype(np.uint32)
+    prior = np.append(prior, np.arange(len(prior), count + 1)).astype(np.uint32)
+    return grown(Cells.of(*samples, mi.UInt32(tree)), mi.UInt32(prior), 2)
 
 
-def _learned(*data) -> TreeBuilder:
-    """One tree, at node 1."""
-    builder = TreeBuilder()
-    assert _add(builder, _samples(*data)) == 1
-    return builder
+def _learned(*data) -> Nodes:
+    """One tree."""
+    return _grown(_samples(*data))
 
 
-def _arrays(builder: TreeBuilder) -> list[np.ndarray]:
-    return [x.numpy() for x in (builder.probability, builder.child, builder.is_even)]
+def _arrays(nodes: Nodes) -> list[np.ndarray]:
+    return [x.numpy() for x in (nodes.probability, nodes.child, nodes.is_even)]
 
 
-def _table(builder: TreeBuilder, root: int = 1) -> np.ndarray:
+def _table(nodes: Nodes, root: int = 0) -> np.ndarray:
     """The density of a tree in the smallest cells, [x, y]."""
-    probability, child, is_even = _arrays(builder)
+    probability, child, is_even = _arrays(nodes)
 
     def table(node: int, axis: int, shape: tuple[int, int]) -> np.ndarray:
         p = float(probability[node])
@@ -64,8 +65,8 @@ def _table(builder: TreeBuilder, root: int = 1) -> np.ndarray:
     return table(root, 0, (CELLS, CELLS))
 
 
-def _is_uniform(builder: TreeBuilder, root: int = 1) -> bool:
-    return float(builder.probability[root]) == LEAF
+def _is_uniform(nodes: Nodes, root: int = 0) -> bool:
+    return float(nodes.probability[root]) == LEAF
 
 
 # ---- Cells ----
@@ -170,8 +171,8 @@ def test_shares_follow_the_means_however_dense_the_samples_are():
     u = _uniform(1 << 14)
     is_left = u[0] < 0.5
     weight = np.where(is_left, 1 / 171, 1 / 256)
-    builder = _learned(u, np.where(is_left, 3, 1) * weight, weight)
-    assert float(builder.probability[1]) == pytest.approx(0.75, abs=2e-3)
+    nodes = _learned(u, np.where(is_left, 3, 1) * weight, weight)
+    assert float(nodes.probability[0]) == pytest.approx(0.75, abs=2e-3)
 
 
 @pytest.mark.parametrize("power", [-66, 66])
@@ -188,32 +189,34 @@ def test_the_same_samples_in_another_order_give_the_same_trees():
     value, tree = rng.lognormal(0, 1, count), rng.integers(0, trees, count)
     results = []
     for order in (np.arange(count), np.argsort(value)):
-        builder = TreeBuilder()
-        _add(builder, _samples(u[:, order], value[order]), tree[order], trees)
-        results.append(_arrays(builder))
+        results.append(_arrays(_grown(_samples(u[:, order], value[order]), tree[order], trees)))
     assert len(results[0][0]) > 5000 and all(map(np.array_equal, *results))
 
 
 # ---- Many trees ----
 
 
-def test_merged_samples_give_the_same_trees():
-    """In each region, the samples of a cell are merged into one."""
-    count, regions = 50_000, 70
+def test_trees_of_surroundings_are_built_from_all_samples_in_them():
+    """Ten regions lie in a region of the level before, and all of these in the first one. Samples
+    of a region belong to the surroundings as well, and some samples belong to them only."""
+    count, small, trees = 50_000, 8, 1 + 7 + 70
     rng, u = np.random.default_rng(4), _uniform(count)
-    region = mi.UInt32(rng.integers(0, regions, count).astype(np.uint32))
-    samples = _samples(u, FUNCTIONS["edge"](*u), rng.uniform(0.2, 5, count))
-    merged = samples.in_order(region).merged()
-    cells = {(int(r), int(c)) for r, c in zip(region.numpy(), samples.code.numpy())}
-    found = zip(merged.tree.numpy().tolist(), merged.code.numpy().tolist())
-    assert sorted(cells) == list(found)
-    results = []
-    for data, tree in ((samples, region), (merged, merged.tree)):
-        builder = TreeBuilder()
-        builder.add(data, tree // 10, regions // 10)
-        builder.add(data, tree, regions, 1 + dr.arange(mi.UInt32, regions) // 10)
-        results.append(_arrays(builder))
-    assert len(results[0][0]) > 1000 and all(map(np.array_equal, *results))
+    region = rng.choice(np.append(np.arange(small), np.arange(small, trees)), count)
+    parent = np.append([0] * small, 1 + np.arange(70) // 10).astype(np.uint32)
+    levels = [slice(0, 1), slice(1, small), slice(small, trees)]
+    data = _samples(u, FUNCTIONS["edge"](*u), rng.uniform(0.2, 5, count))
+    cells = Cells.of(*data, mi.UInt32(region), mi.UInt32(parent), levels)
+    prior = mi.UInt32(np.append(parent, trees))
+    nested = _arrays(grown(cells, prior, len(levels), small))
+    # The same with a copy of each sample for each tree around it
+    around = [region, parent[region], parent[parent[region]]]
+    own = np.concatenate([np.full(count, True), *(a != b for a, b in zip(around[1:], around))])
+    index, tree = np.tile(np.arange(count), 3)[own], np.concatenate(around)[own]
+    copies = [dr.gather(type(x), x, mi.UInt32(index)) for x in data]
+    alone = _arrays(grown(Cells.of(*copies, mi.UInt32(tree)), prior, len(levels)))
+    assert len(nested[0]) > 1000
+    for x, y in zip(nested, alone):
+        np.testing.assert_allclose(x, y, atol=1e-4)
 
 
 def test_trees_built_together_equal_trees_built_alone():
@@ -227,12 +230,12 @@ def test_trees_built_together_equal_trees_built_alone():
     order = np.random.default_rng(2).permutation(2 * len(tree))
     # As many samples that belong to none
     u, value = np.concatenate([u, 1 - u], 1)[:, order], np.tile(value, 2)[order]
-    none = np.resize([len(counts), 2**24, 2**24 + 1, 2**32 - 1], len(tree))
+    none = np.resize([len(counts), len(counts) + 1, 2**24 - 1], len(tree))
     tree = np.concatenate([tree, none])[order]
-    builder = TreeBuilder()
-    first = _add(builder, _samples(u, value), tree, len(counts))
+    nodes = _grown(_samples(u, value), tree, len(counts))
+    assert _is_uniform(nodes, len(counts))
     for index, part in enumerate(parts):
-        together = _table(builder, first + index)
+        together = _table(nodes, index)
         assert (together == 1).all() == (counts[index] < SPLIT)
         if counts[index] > 0:
             alone = _table(_learned(part, functions[index](*part)))
@@ -240,35 +243,55 @@ def test_trees_built_together_equal_trees_built_alone():
 
 
 def test_forests_follow_each_other():
-    builder, u = TreeBuilder(), _uniform(1 << 12)
-    assert builder.node_count == 1 and _is_uniform(builder, 0)
-    first = _add(builder, _samples(u, u[0]))
-    before = _table(builder, first)
-    count = builder.node_count
-    assert _add(builder, _samples(u, u[1])) == count
-    np.testing.assert_array_equal(_table(builder, first), before)
-    np.testing.assert_array_equal(_table(builder, count), _table(_learned(u, u[1])))
+    u = _uniform(1 << 12)
+    one, other = (_learned(u, x) for x in u)
+    nodes = one.followed_by(other)
+    assert nodes.count == one.count + other.count
+    np.testing.assert_array_equal(_table(nodes), _table(one))
+    np.testing.assert_array_equal(_table(nodes, one.count), _table(other))
 
 
 def test_samples_are_drawn_by_the_densities_that_were_learned():
     """What is built is what ``SampleTrees`` wants; leaves are the same."""
-    builder, u = TreeBuilder(), _uniform(1 << 12)
+    u = _uniform(1 << 12)
     value = [f(*u) for f in FUNCTIONS.values()]
     tree, count = np.repeat(np.arange(len(value)), u.shape[1]), len(value)
-    first = _add(builder, _samples(np.tile(u, count), np.concatenate(value)), tree, count)
-    roots = first + dr.arange(mi.UInt32, count)
-    shape, share = (builder.probability, builder.child, builder.is_even), mi.Float([1.0] * count)
-    trees = SampleTrees(*shape, roots, share, dr.arange(mi.UInt32, builder.node_count))
-    tree = dr.repeat(dr.arange(mi.UInt32, count), 1 << DEPTH)
+    nodes = _grown(_samples(np.tile(u, count), np.concatenate(value)), tree, count)
+    shape, share = (nodes.probability, nodes.child, nodes.is_even), mi.Float([1.0] * count)
+    roots = dr.arange(mi.UInt32, count)
+    trees = SampleTrees(*shape, roots, share, dr.arange(mi.UInt32, nodes.count))
+    tree = dr.repeat(roots, 1 << DEPTH)
     code = dr.tile(dr.arange(mi.UInt32, 1 << DEPTH), count)
     density, leaf = trees.density(tree, cell_centre(code), mi.Bool(True))
     x, y = (cell_centre(code).numpy() * CELLS).astype(int)
-    tables = np.array([_table(builder, first + index) for index in range(count)])
+    tables = np.array([_table(nodes, index) for index in range(count)])
     # Probabilities are rounded to nine bits
     np.testing.assert_allclose(density.numpy(), tables[tree.numpy(), x, y], rtol=0.1, atol=0.05)
-    node = builder.leaf(dr.gather(mi.UInt32, roots, tree), code)
+    node = nodes.leaf(tree, code)
     assert bool(dr.all(trees.value(leaf, mi.Bool(True)) == node))
-    assert bool(dr.all(dr.gather(mi.Float, builder.probability, node) == LEAF))
+    assert bool(dr.all(dr.gather(mi.Float, nodes.probability, node) == LEAF))
+
+
+@pytest.mark.parametrize("trees", [5, 500])
+@pytest.mark.parametrize("levels", [1, 3, 5])
+def test_launches_do_not_grow_with_the_trees_or_their_levels(trees: int, levels: int):
+    """Each launch takes 10 µs on a GPU. The nodes of a depth are split together; the cells of each
+    level of surroundings are added up in two kernels."""
+    count = 20_000
+    rng, u = np.random.default_rng(1), _uniform(count)
+    tree = rng.integers(trees * (levels - 1), trees * levels, count)
+    number = np.arange(trees * levels)
+    parent = np.where(number < trees, number, number - trees)
+    slices = [slice(start, start + trees) for start in number[::trees]]
+    data, prior = _samples(u, FUNCTIONS["spot"](*u)), np.append(parent, trees * levels)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        cells = Cells.of(*data, mi.UInt32(tree), mi.UInt32(parent), slices)
+        nodes = grown(cells, mi.UInt32(prior), levels, slices[-1].start)
+        dr.eval(nodes)
+        launches = len(dr.kernel_history())
+    assert nodes.count > trees * levels
+    assert launches <= 110 + 4 * levels, launches
 
 
 # ---- What is expected ----
@@ -276,12 +299,15 @@ def test_samples_are_drawn_by_the_densities_that_were_learned():
 
 def _with_expected(u, value, name: str = "ramp") -> tuple[np.ndarray, np.ndarray]:
     """The densities of a tree, and of the one of a function that is expected."""
-    builder, many = TreeBuilder(), _uniform(1 << 16, 9)
-    root, edge = (_add(builder, _samples(many, FUNCTIONS[n](*many))) for n in (name, "edge"))
+    many = _uniform(1 << 16, 9)
+    values = [FUNCTIONS[n](*many) for n in ("edge", name)]
+    value = np.broadcast_to(value, u.shape[1])
+    tree = np.repeat([0, 1, 3], [many.shape[1], many.shape[1], u.shape[1]])
+    data = _samples(np.concatenate([many, many, u], axis=1), np.concatenate([*values, value]))
     # Another tree, without a sample, is the one that is expected of it
-    first = _add(builder, _samples(u, value), 1, 2, mi.UInt32([edge, root]))
-    np.testing.assert_array_equal(_table(builder, first), _table(builder, edge))
-    return _table(builder, first + 1), _table(builder, root)
+    nodes = _grown(data, tree, 4, [0, 1, 0, 1])
+    np.testing.assert_array_equal(_table(nodes, 2), _table(nodes, 0))
+    return _table(nodes, 3), _table(nodes, 1)
 
 
 @pytest.mark.parametrize("count", [1, SPLIT - 1])
