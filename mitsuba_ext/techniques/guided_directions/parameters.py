@@ -11,7 +11,7 @@ from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
 from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
-from .surface_regions import SurfaceRegions
+from .surface_regions import BYTES_PER_REGION, SurfaceRegions
 from .tile_regions import MOST_BOUNCES, TileRegions
 
 #: The fewest pilot samples that a region of surfaces should have.
@@ -57,7 +57,8 @@ class Guided(Technique):
 
         def surfaces(p: mi.Point3f, n: mi.Normal3f) -> SurfaceRegions:
             # The scout has one path in each pixel
-            return SurfaceRegions(p, n, max(1.0, _REGION_SAMPLES * width * height / samples))
+            least = max(1.0, _REGION_SAMPLES * width * height / samples)
+            return SurfaceRegions(p, n, least, int(self.max_memory * 2**20) // BYTES_PER_REGION)
 
         by_tiles = self.regions == "tiles"
         return GuideLearner(

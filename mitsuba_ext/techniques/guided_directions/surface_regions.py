@@ -14,6 +14,10 @@ from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import Cells, Nodes, grown
 
+#: About the most bytes of a region while trees are built: all cells are stored for the regions in
+#: which there are smaller ones.
+BYTES_PER_REGION = 1 << 14
+
 #: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
 _PRIOR = 32
 
@@ -27,13 +31,16 @@ class SurfaceRegions:
     Parameters:
         p, n: Vertices where paths scatter, and normals on the side that is lit; not empty.
         least: The least number of these vertices in a region.
+        most: The most regions.
 
     Attributes:
         count: Number of regions that learn.
     """
 
-    def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
-        self._set(NestedRegions(p, n, least))
+    def __init__(
+        self, p: mi.Point3f, n: mi.Normal3f, least: float, most: int = 1 << 30
+    ) -> None:
+        self._set(NestedRegions(p, n, least, most))
 
     def _set(self, regions: NestedRegions) -> None:
         self._regions, self.count = regions, regions.count

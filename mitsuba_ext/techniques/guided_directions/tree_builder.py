@@ -86,40 +86,8 @@ class Cells:
             levels: The trees of each level. All cells are stored for all levels except the last
                 one, where few cells of a tree have a sample.
         """
-        # In double precision, so that the order of the samples does not matter. Opaque: other
-        # counts share the kernel
-        count = dr.opaque(mi.UInt32, len(value))
-        scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / mi.Float64(count), 1e-30))
-        key = (tree << DEPTH) | code
-        order = dr.argsort(key)
-        key = dr.gather(mi.UInt32, key, order)
-        # The largest of n values is at most n times their mean
-        value = dr.minimum(mi.Float64(dr.gather(mi.Float, value, order)) * scale, _LIMIT)
-        weight = mi.Float64(dr.gather(mi.Float, weight, order))
-        fixed = [mi.UInt64(x * y) for x, y in zip((value, dr.square(value), weight), _UNITS)]
-        # The last sample of each cell
-        index = dr.arange(mi.UInt32, len(key))
-        following = dr.gather(mi.UInt32, key, index + 1, index + 1 < count)
-        is_last = (index + 1 == count) | (key != following)
-        # Evaluated together: each of them alone would be a kernel of its own
-        dr.eval(key, fixed, is_last)
-        running = [dr.cumsum(x) for x in fixed]
-        last = dr.compress(is_last)
-
-        rows = levels[-1].start << DEPTH
-        size = rows + 1 + len(last)
-        cells = cls(*_empty(mi.UInt32, size, 1), *_empty(mi.UInt64, size, 3))
-        # One cell more, before the first one
-        cell = dr.arange(mi.UInt32, 1 + len(last))
-        is_cell = cell > 0
-        place = cell + dr.opaque(mi.UInt32, rows)
-        sample = dr.gather(mi.UInt32, last, cell - 1, is_cell)
-        for target, x in zip(cells.sums, running):
-            _write(target, dr.gather(mi.UInt64, x, sample, is_cell), place)
-        key = dr.gather(mi.UInt32, key, sample)
-        _write(cells.key, dr.select(is_cell, key, dr.maximum(key, 1) - 1), place)
-        dr.eval(cells)
-        if rows > 0:
+        cells = _cells_of(code, value, weight, tree, levels[-1].start << DEPTH)
+        if levels[-1].start > 0:
             cells._surround(parent, levels)
         return cells
 
@@ -161,7 +129,8 @@ class Cells:
         key = dr.gather(mi.UInt32, self.key, place)
         tree = key >> DEPTH
         key = dr.select(tree < rows, key, around(key))
-        add(key, self.between(place, place + 1), tree < trees)
+        sums = self.between(place, place + 1)
+        add(key, sums, tree < trees)
         for level in reversed(levels[1:-1]):
             if level.start == level.stop:
                 continue
@@ -171,10 +140,49 @@ class Cells:
             # Read before the table changes
             dr.eval(sums)
             add(around(key), sums, sums[2] > 0)
+        del sums
+        running = [dr.cumsum(table.pop(0)) for _ in range(3)]
         key = dr.arange(mi.UInt32, count)
-        for target, x in zip((self.key, *self.sums), (key, *(dr.cumsum(x) for x in table))):
+        for target, x in zip((self.key, *self.sums), (key, *running)):
             _write(target, x, key)
         dr.eval(self)
+
+
+def _cells_of(code, value, weight, tree, before: int) -> Cells:
+    """The cells of samples that have some, in order; and ``before`` them, empty places."""
+    # In double precision, so that the order of the samples does not matter. Opaque: other
+    # counts share the kernel
+    count = dr.opaque(mi.UInt32, len(value))
+    scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / mi.Float64(count), 1e-30))
+    key = (tree << DEPTH) | code
+    order = dr.argsort(key)
+    key = dr.gather(mi.UInt32, key, order)
+    # The largest of n values is at most n times their mean
+    value = dr.minimum(mi.Float64(dr.gather(mi.Float, value, order)) * scale, _LIMIT)
+    weight = mi.Float64(dr.gather(mi.Float, weight, order))
+    fixed = [mi.UInt64(x * y) for x, y in zip((value, dr.square(value), weight), _UNITS)]
+    # The last sample of each cell
+    index = dr.arange(mi.UInt32, len(key))
+    following = dr.gather(mi.UInt32, key, index + 1, index + 1 < count)
+    is_last = (index + 1 == count) | (key != following)
+    # Evaluated together: each of them alone would be a kernel of its own
+    dr.eval(key, fixed, is_last)
+    running = [dr.cumsum(x) for x in fixed]
+    last = dr.compress(is_last)
+    cell = dr.arange(mi.UInt32, 1 + len(last))
+    is_cell = cell > 0
+    sample = dr.gather(mi.UInt32, last, cell - 1, is_cell)
+    # An entry of zeros stands before the first cell
+    key = dr.gather(mi.UInt32, key, sample)
+    key = dr.select(is_cell, key, dr.maximum(key, 1) - 1)
+    size = before + 1 + len(last)
+    cells = Cells(*_empty(mi.UInt32, size, 1), *_empty(mi.UInt64, size, 3))
+    place = cell + dr.opaque(mi.UInt32, before)
+    _write(cells.key, key, place)
+    for target, x in zip(cells.sums, running):
+        _write(target, dr.gather(mi.UInt64, x, sample, is_cell), place)
+    dr.eval(cells)
+    return cells
 
 
 @dataclass
@@ -292,6 +300,8 @@ class _Growth:
             dr.zeros(mi.UInt32, starts[-1]),
             dr.zeros(mi.Bool, starts[-1]),
         )
+        # Opaque, also where no tree is split
+        dr.make_opaque(nodes)
         parities = [dr.opaque(mi.Bool, is_even) for is_even in (True, False)]
         first_below = dr.opaque(mi.UInt32, starts[-2])
         # Mean square of the density below each node, if it is one on average
