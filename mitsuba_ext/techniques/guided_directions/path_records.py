@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +17,21 @@ from .tree_builder import DEPTH, cell_code
 
 #: The most bytes of a record, including the temporaries while trees are built.
 BYTES_PER_RECORD = 320
+
+
+@dataclass
+class _Columns:
+    """What is recorded of each sample."""
+
+    region: mi.UInt32
+    code: mi.UInt32
+    history: mi.UInt32
+    bounce: mi.UInt32
+    value: mi.Float
+    weight: mi.Float
+    importance: mi.Float
+    throughput: mi.Float
+    batch: mi.UInt32
 
 
 class PathRecords(Observer):
@@ -52,7 +68,8 @@ class PathRecords(Observer):
     ) -> None:
         self._region, self.bounces, self.stride = region, bounces, stride
         self._pixels = pixels
-        self._lanes, self._passes = 0, []
+        self._lanes = 0
+        self._passes: list[_Columns] = []
         self.restart_counting()
 
     def restart_counting(self) -> None:
@@ -121,10 +138,10 @@ class PathRecords(Observer):
         self._collect()
         if not self._passes:
             return
-        columns = [joined(parts) for parts in zip(*self._passes)]
-        self.region, self.code, self.history, self.bounce = columns[:4]
-        self.value, self.weight, self.importance, self.throughput, self.batch = columns[4:]
-        self._passes = [columns]
+        # All columns together: each part of them is one kernel
+        self._passes = [joined(self._passes)]
+        for name, column in vars(self._passes[0]).items():
+            setattr(self, name, column)
 
     def _collect(self) -> None:
         """Keeps what the last pass has recorded."""
@@ -135,8 +152,7 @@ class PathRecords(Observer):
         self._pixels.add(pixel, self._total)
         importance, error = self._pixels.importance(pixel, self._total)
         self.paths += self._lanes
-        batch = np.arange(self._lanes) % BATCHES
-        self.variances += np.bincount(batch, error.numpy(), BATCHES)
+        self.variances += _batch_sums(error)
         slot = dr.compress(self._weights > 0)
         self._lanes = 0
         if len(slot) == 0:
@@ -155,12 +171,21 @@ class PathRecords(Observer):
             code = dr.gather(mi.UInt32, self._keys, earlier * self._slots + path, is_earlier)
             code &= (1 << DEPTH) - 1
             history = dr.select(is_earlier, (history << DEPTH) | code, history)
-        columns = [
+        columns = _Columns(
             key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
             dr.gather(mi.Float, importance, path), dr.gather(mi.Float, self._throughput, slot),
             path % BATCHES,
-        ]
+        )  # fmt: skip
         dr.eval(columns)
         self._passes.append(columns)
         self._keys = self._weights = self._before = self._throughput = None
         self._total = self._pixel = None
+
+
+def _batch_sums(x: mi.Float) -> np.ndarray:
+    """The sums of ``x`` over the paths of each batch, in a fixed order."""
+    length = -(-len(x) // BATCHES)
+    index, size = dr.arange(mi.UInt32, BATCHES * length), dr.opaque(mi.UInt32, length)
+    path = index % size * BATCHES + index // size
+    in_order = dr.gather(mi.Float, x, path, path < dr.opaque(mi.UInt32, len(x)))
+    return dr.block_sum(mi.Float64(in_order), length, mode="evaluated").numpy()
