@@ -58,7 +58,9 @@ class Guided(Technique):
         def surfaces(p: mi.Point3f, n: mi.Normal3f) -> SurfaceRegions:
             # The scout has one path in each pixel
             least = max(1.0, _REGION_SAMPLES * width * height / samples)
-            return SurfaceRegions(p, n, least, int(self.max_memory * 2**20) // BYTES_PER_REGION)
+            # Records take the other half of the memory
+            most = int(self.max_memory * 2**20 / 2) // BYTES_PER_REGION
+            return SurfaceRegions(p, n, least, max(1, most))
 
         by_tiles = self.regions == "tiles"
         return GuideLearner(

@@ -21,6 +21,9 @@ BYTES_PER_REGION = 1 << 14
 #: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
 _PRIOR = 32
 
+#: Units of sums over the records of a region, per mean of all records.
+_UNITS = 2.0**20
+
 
 class SurfaceRegions:
     """A tree for each of some regions of surfaces (:class:`NestedRegions`).
@@ -103,12 +106,7 @@ class SurfaceRegions:
     def incident_radiance(self, records: PathRecords) -> mi.Float:
         """The mean radiance that bounces find in each region; the surrounding region is the prior.
         −1 for mirrors and glass. Shape [regions]."""
-        region = records.region.numpy()
-        # In double precision and a fixed order: equal seeds make equal sums
-        value, throughput, count = (
-            np.bincount(region, x, self.count + 1)
-            for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))
-        )
+        value, throughput, count = self._sums(records)
         for regions in reversed(self._regions.levels[1:]):
             for x in (value, throughput, count):
                 np.add.at(x, self._regions.parent[regions], x[regions])
@@ -123,12 +121,20 @@ class SurfaceRegions:
             )
         return from_numpy(mi.Float, np.minimum(radiance, 1e30))
 
-    def _around(self, level: int) -> np.ndarray:
-        """For each region, the region of a level in which it lies; itself if there is none."""
-        around = np.arange(self.count + 1, dtype=np.uint32)
-        for smaller in self._regions.levels[level + 1 :]:
-            around[smaller] = around[self._regions.parent[smaller]]
-        return around
+    def _sums(self, records: PathRecords) -> np.ndarray:
+        """The sums of values and throughputs, and the number of records, in each region."""
+        values = records.value, records.throughput
+        # In units relative to the mean: sums of integers do not depend on their order
+        count = dr.opaque(mi.Float64, len(records.region))
+        means = [dr.maximum(dr.sum(mi.Float64(x)) / count, 1e-30) for x in values]
+        units = [mi.UInt64(mi.Float64(x) / mean * _UNITS + 0.5) for x, mean in zip(values, means)]
+        sums = dr.zeros(mi.UInt64, 3 * self.tree_count)
+        for index, x in enumerate((*units, mi.UInt64(1))):
+            place = 3 * records.region + index
+            dr.scatter_add(sums, x, place, mode=dr.ReduceMode.Direct)
+        dr.eval(sums, means)
+        unit = [float(mean[0]) / _UNITS for mean in means]
+        return sums.numpy().reshape(-1, 3).T * np.array([*unit, 1.0])[:, None]
 
     def __str__(self) -> str:
         return f"{self.count} regions of surfaces"

@@ -214,12 +214,20 @@ def test_mirrors_and_glass_neither_learn_nor_are_guided(surfaces: SurfaceRegions
         assert probability[-1] == LEAF and (probability[:-1] != LEAF).any() == is_guided
 
 
+def _around(surfaces: SurfaceRegions, level: int) -> np.ndarray:
+    """For each region, the region of a level in which it lies; itself if there is none."""
+    around = np.arange(surfaces.count + 1)
+    for smaller in surfaces._regions.levels[level + 1 :]:
+        around[smaller] = around[surfaces._regions.parent[smaller]]
+    return around
+
+
 def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> None:
     p, n = _points(20_000)
     labels, side = _labels(surfaces, p, n), np.where(n[2] > 0, 1, -1)
     extents, inside = [], []
     for level in range(len(surfaces._regions.levels)):
-        around, regions = surfaces._around(level)[labels], surfaces._regions.levels[level]
+        around, regions = _around(surfaces, level)[labels], surfaces._regions.levels[level]
         members = [around == region for region in range(regions.start, regions.stop)]
         assert all(LEAST <= chosen.sum() for chosen in members)
         extents.append(max(np.ptp(p[:, chosen], axis=1).max() for chosen in members))
@@ -227,7 +235,7 @@ def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> No
         if level > 0:
             assert all(np.ptp(side[chosen]) == 0 for chosen in members)
             # Each lies in one of the level before
-            before = surfaces._around(level - 1)[labels]
+            before = _around(surfaces, level - 1)[labels]
             assert all(len(set(before[chosen])) == 1 for chosen in members)
     assert inside[0] == 1 and (np.diff(inside) <= 0).all() and inside[-1] < inside[1]
     expected = 1.05 / np.array([1, 4, 8, 16, 32])
