@@ -10,6 +10,7 @@ import mitsuba as mi
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...transport.path_decisions import LARGEST_PROBABILITY, unguided_throughput
+from ...util.arrays import joined
 
 #: The number of bounces that are recorded (later ones count as they were drawn), and about the most
 #: paths of a pass, which suffice for the few sums.
@@ -120,7 +121,7 @@ class RouletteTrial(Observer):
             columns += [mi.Float64(more * weight), mi.Float64(segments)]
         # Evaluated together: each of them alone would be a kernel of its own
         dr.eval(columns)
-        error, *sums = (float(dr.sum(x)[0]) for x in columns)
+        error, *sums = joined([dr.sum(x) for x in columns]).numpy().tolist()
         effects = [Outcome(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
         self.drawn, self.by_throughput, self.unguided = (
             Outcome(*(x + y for x, y in zip(old, new)))

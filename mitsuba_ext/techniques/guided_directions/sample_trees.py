@@ -65,24 +65,20 @@ class SampleTrees:
         # Opaque: trees of other sizes share the kernels
         first = dr.opaque(mi.UInt32, len(root))
         dr.scatter(block, first + 4 * dr.arange(mi.UInt32, len(inner)), inner)
-        bits, grandchildren = _pack(probability, child)
-        dr.eval(block, bits, grandchildren)
-
         slots = len(root) + 4 * len(inner)
-        self._nodes = dr.zeros(mi.Float, 2 * slots)
-        self._values = dr.zeros(mi.UInt32, 0 if value is None else slots)
-        placed = [(dr.arange(mi.UInt32, len(root)), root)]
-        for index, node in enumerate(grandchildren):
-            # Opaque: they share a kernel
-            slot = dr.gather(mi.UInt32, block, inner) + dr.opaque(mi.UInt32, index)
-            placed.append((slot, dr.gather(mi.UInt32, node, inner)))
-        for slot, node in placed:
-            packed = mi.Point2u(
-                dr.gather(mi.UInt32, bits, node), dr.gather(mi.UInt32, block, node)
-            )
-            dr.scatter(self._nodes, dr.reinterpret_array(mi.Point2f, packed), slot)
-            if value is not None:
-                dr.scatter(self._values, dr.gather(mi.UInt32, value, node), slot)
+        node, slot = dr.empty(mi.UInt32, slots), first + 4 * dr.arange(mi.UInt32, len(inner))
+        for index, grandchild in enumerate(_pack(probability, child, inner)[1]):
+            # One kernel: none of them writes to the places of another
+            dr.scatter(node, grandchild, slot + index, mode=dr.ReduceMode.Permute)
+        dr.scatter(node, root, dr.arange(mi.UInt32, len(root)), mode=dr.ReduceMode.Permute)
+        dr.eval(node, block)
+
+        bits, _ = _pack(probability, child, node)
+        packed = mi.Point2u(bits, dr.gather(mi.UInt32, block, node))
+        self._nodes = dr.empty(mi.Float, 2 * slots)
+        slot = dr.arange(mi.UInt32, slots)
+        dr.scatter(self._nodes, dr.reinterpret_array(mi.Point2f, packed), slot)
+        self._values = mi.UInt32() if value is None else dr.gather(mi.UInt32, value, node)
         # A tree without splits is skipped
         is_leaf = dr.gather(mi.Float, probability, root) < 0
         self.share = dr.select(is_leaf, 0, share)
@@ -229,14 +225,17 @@ def _choose(x: mi.Float, bits: mi.UInt32, by_tree: mi.Bool) -> tuple[mi.Float, m
     return dr.minimum(x, _ALMOST_ONE), is_upper, dr.select(is_upper, 1 - p, p)
 
 
-def _pack(probability: mi.Float, child: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt32]]:
-    """The first word of each packed node, for nodes that are split along the first axis, and the
-    four nodes two levels below it (a child twice, where that child is not split)."""
-    is_inner = probability >= 0
-    bits = _rounded(probability)
+def _pack(
+    probability: mi.Float, child: mi.UInt32, place: mi.UInt32
+) -> tuple[mi.UInt32, list[mi.UInt32]]:
+    """The first word of packed nodes, for nodes that are split along the first axis, and the four
+    nodes two levels below each (a child twice, where that child is not split)."""
+    p = dr.gather(mi.Float, probability, place)
+    is_inner, first_child = p >= 0, dr.gather(mi.UInt32, child, place)
+    bits = _rounded(p)
     grandchildren = []
     for side in range(2):
-        node = dr.select(is_inner, child + side, 0)
+        node = dr.select(is_inner, first_child + side, 0)
         p = dr.gather(mi.Float, probability, node)
         is_split = is_inner & (p >= 0)
         bits |= _rounded(dr.select(is_split, p, 0.5)) << (_BITS * (1 + side))
