@@ -122,7 +122,7 @@ class Cells:
 
         def add(key: mi.UInt32, sums: list[mi.UInt64], active: mi.Bool) -> None:
             for target, x in zip(table, sums):
-                dr.scatter_add(target, x, key, active, mode=dr.ReduceMode.Direct)
+                dr.scatter_add(target, x, key, active & (x > 0), mode=dr.ReduceMode.Direct)
             dr.eval(table)
 
         place = dr.arange(mi.UInt32, len(self.key) - count - 1) + (rows << DEPTH) + 1
@@ -139,7 +139,7 @@ class Cells:
             sums = [dr.gather(mi.UInt64, x, key) for x in table]
             # Read before the table changes
             dr.eval(sums)
-            add(around(key), sums, sums[2] > 0)
+            add(around(key), sums, mi.Bool(True))
         del sums
         running = [dr.cumsum(table.pop(0)) for _ in range(3)]
         key = dr.arange(mi.UInt32, count)
