@@ -4,8 +4,12 @@ The target density of a tree is proportional to the mean contribution of the sam
 the mean square would give the least variance, but squares of contributions are too noisy to be
 learned from few samples.) The shares of the two halves of a cell are estimated from the samples in
 them, with a prior: equal shares or, where there is a tree for larger surroundings, the shares of
-that tree in the same cell. A cell with too few samples to be split takes over the splits of that
-tree.
+that tree in the same cell, if it keeps a split there. A cell with too few samples to be split takes
+over the splits of that tree.
+
+Samples are sorted by tree and cell once. The sums over the samples of any node are then differences
+of running sums. Nodes of the same depth are split together, in all trees; from the leaves up, splits
+that change little are then removed.
 
 Source: Guo, PhD thesis, section 2.3.4 (mid-point splits, axes in turn); the estimates are ours.
 """
@@ -149,7 +153,7 @@ class Cells:
 
 
 def _cells_of(code, value, weight, tree, before: int) -> Cells:
-    """The cells of samples that have some, in order; and ``before`` them, empty places."""
+    """The cells that have samples, in order, after a number of places that are not set yet."""
     # In double precision, so that the order of the samples does not matter. Opaque: other
     # counts share the kernel
     count = dr.opaque(mi.UInt32, len(value))
@@ -326,9 +330,13 @@ class _Growth:
     def _settled(
         self, level: _Level, node: mi.UInt32, below: mi.Float
     ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-        """The probability, the mean square and the left child of a node that is split. The mean
-        square is 1 where there is none."""
-        # The node, the node that is its prior, the prior of this one etc.
+        """The probability of the left half, the mean square of the density, and the left child of
+        nodes that are split. The mean square is 1 where ``node`` is ``_NONE``.
+
+        Parameters:
+            below: The mean square below each node of the next depth.
+        """
+        # The node, its prior, the prior of its prior, and so on
         links, shares = [], []
         for _ in range(self._forests):
             active = node != _NONE
@@ -343,10 +351,9 @@ class _Growth:
             halves = dr.gather(mi.Point2f, below, left >> 1, active)
             new = 2 * (dr.square(p) * halves.x + dr.square(1 - p) * halves.y)
             new = dr.select(active, new, 1)
-            prior = p
-            # A prior that becomes a leaf expects equal shares
-            p = dr.select(new > 1 + _LEAST_CHANGE, p, 0.5)
-        return prior, new, left
+            # A prior without this split expects equal shares
+            own, p = p, dr.select(new > 1 + _LEAST_CHANGE, p, 0.5)
+        return own, new, left
 
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
         """The sums of values, squares and weights of the cells [begin, end)."""
@@ -380,14 +387,13 @@ class _Level:
 
     @dr.syntax
     def source(self, node: mi.UInt32) -> mi.UInt32:
-        """The node whose split a node has: itself, or the next one among its twins, twins of these
-        etc. that is split."""
+        """The node whose split a node takes: itself if it is split, else its twin, the twin of its
+        twin, and so on. ``_NONE`` if none of them is split."""
         node = mi.UInt32(node)
         active = node != _NONE
         while active:
             is_split = dr.gather(mi.Float, self.evidence, node) >= _SPLIT
-            if ~is_split:
-                node = dr.gather(mi.UInt32, self.twin, node)
+            node = dr.select(is_split, node, dr.gather(mi.UInt32, self.twin, node))
             active = ~is_split & (node != _NONE)
         return node
 
@@ -413,8 +419,8 @@ def cell_centre(code: mi.UInt32) -> mi.Point2f:
 
 
 def _write(target: mi.UInt32 | mi.UInt64 | mi.Float, value: Any, place: mi.UInt32) -> None:
-    """Writes to places of which each is written once. (Otherwise, the second ``dr.scatter`` to an
-    array evaluates the first one.)"""
+    """Writes to places, no two of which are the same. Without this promise, a second ``dr.scatter``
+    to the array would evaluate the first one: two kernels instead of one."""
     dr.scatter(target, value, place, mode=dr.ReduceMode.Permute)
 
 
