@@ -62,6 +62,12 @@ def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = Tr
     dr.scatter_add(target, value, index, active, dr.ReduceMode.NoConflicts)
 
 
+def put(target: T, value: Any, place: mi.UInt32) -> None:
+    """Writes to elements that nothing else writes to. ``dr.scatter`` alone would first evaluate
+    what was written to the array before: a kernel each time instead of one for all."""
+    dr.scatter(target, value, place, mode=dr.ReduceMode.Permute)
+
+
 def joined(parts: Sequence[T]) -> T:
     """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
     type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""

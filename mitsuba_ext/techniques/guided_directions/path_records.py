@@ -13,7 +13,7 @@ from ...planning.evidence import BATCHES
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...util.arrays import joined
-from .tree_builder import DEPTH, cell_code
+from .cells import DEPTH, cell_code
 
 #: The most bytes of a record, including the temporaries while trees are built.
 BYTES_PER_RECORD = 320

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...util.arrays import from_numpy
+from ...util.arrays import from_numpy, put
 from ...util.stored_arrays import StoredArrays
 
 #: The value that marks a leaf, in place of a probability.
@@ -68,9 +68,8 @@ class SampleTrees:
         slots = len(root) + 4 * len(inner)
         node, slot = dr.empty(mi.UInt32, slots), first + 4 * dr.arange(mi.UInt32, len(inner))
         for index, grandchild in enumerate(_pack(probability, child, inner)[1]):
-            # One kernel: none of them writes to the places of another
-            dr.scatter(node, grandchild, slot + index, mode=dr.ReduceMode.Permute)
-        dr.scatter(node, root, dr.arange(mi.UInt32, len(root)), mode=dr.ReduceMode.Permute)
+            put(node, grandchild, slot + index)
+        put(node, root, dr.arange(mi.UInt32, len(root)))
         dr.eval(node, block)
 
         bits, _ = _pack(probability, child, node)

@@ -10,9 +10,10 @@ from ...scene.regions.nested_regions import NestedRegions
 from ...scene.regions.surface_voxels import lit_normal
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
+from .cells import Cells
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
-from .tree_builder import Cells, Nodes, grown
+from .tree_builder import Nodes, grown
 
 #: About the most bytes of a region while trees are built: all cells are stored for the regions in
 #: which there are smaller ones.

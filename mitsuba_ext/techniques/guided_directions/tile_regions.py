@@ -13,9 +13,10 @@ import numpy as np
 from ...rendering.film_tiles import FilmTiles
 from ...util.arrays import from_numpy, joined
 from ...util.stored_arrays import StoredArrays
+from .cells import DEPTH, Cells
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
-from .tree_builder import DEPTH, Cells, Nodes, grown
+from .tree_builder import Nodes, grown
 
 #: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.
 _GROUPS = (8, 4, 2, 1)
@@ -99,10 +100,10 @@ class TileRegions:
             )
             tile_tree = tile + dr.opaque(mi.UInt32, first_tile)
             parent = from_numpy(mi.UInt32, around)
-            cells = Cells.of(code, value, weight, tile_tree, parent, levels)
             if bounce == 0:
                 # The tiles' trees are followed by one without splits, for leaves that no path has
                 # reached
+                cells = Cells.of(code, value, weight, tile_tree, parent, levels)
                 prior = from_numpy(mi.UInt32, np.append(around, first_below))
                 nodes = grown(cells, prior, len(levels), first_tile)
                 roots = dr.arange(mi.UInt32, self.count + 1) + dr.opaque(mi.UInt32, first_tile)
@@ -124,8 +125,10 @@ class TileRegions:
             # Neighbouring tiles can share a leaf: either of them can give the prior
             expected = dr.zeros(mi.UInt32, len(leaves))
             dr.scatter_reduce(dr.ReduceOp.Max, expected, tile_tree, number)
-            below_tree = number + dr.opaque(mi.UInt32, first_below)
-            cells = joined([cells, Cells.of(code, value, weight, below_tree)])
+            # A sample belongs to two trees
+            code, value, weight = (joined([x, x]) for x in (code, value, weight))
+            tree = joined([tile_tree, number + dr.opaque(mi.UInt32, first_below)])
+            cells = Cells.of(code, value, weight, tree, parent, levels)
             last = dr.opaque(mi.UInt32, first_below + len(leaves), 1)
             prior = joined([parent, expected, last])
             grown_nodes = grown(cells, prior, len(levels) + 1, first_tile)

@@ -8,26 +8,22 @@ that tree in the same cell, if it keeps a split there. A cell with too few sampl
 over the splits of that tree.
 
 Samples are sorted by tree and cell once. The sums over the samples of any node are then differences
-of running sums. Nodes of the same depth are split together, in all trees; from the leaves up, splits
-that change little are then removed.
+of running sums. Nodes of the same depth are split together, in all trees. Then, from the leaves up,
+splits that change little are removed.
 
 Source: Guo, PhD thesis, section 2.3.4 (mid-point splits, axes in turn); the estimates are ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ...util.arrays import joined
+from ...util.arrays import joined, put
+from .cells import CELLS, DEPTH, UNITS, Cells
 from .sample_trees import LEAF
-
-#: The most splits from the root of a tree to a leaf.
-DEPTH = 8
 
 #: In samples of equal contribution (effective sample sizes): the least number in a cell that is
 #: split, and the weight of the prior.
@@ -36,157 +32,8 @@ _SPLIT, _PRIOR = 4.0, 16.0
 #: A subtree that changes the mean square of the density by less than this share becomes a leaf.
 _LEAST_CHANGE = 0.05
 
-#: Fixed point of contributions, their squares and weights. Sums of integers are exact, so that the
-#: same samples give the same trees.
-_UNITS = 2.0**20, 2.0**26, 2.0**20
-
-#: Contributions are clipped to this many times their mean. So a sum of squares is at most this
-#: times the number of samples, which is less than 2⁶⁴ units.
-_LIMIT = 2.0**12
-
 #: In place of the number of a node.
 _NONE = 0xFFFFFFFF
-
-
-@dataclass
-class Cells:
-    """Running sums over the cells of some trees, from which the sums over a tree's cells follow.
-
-    Attributes:
-        key: The number of the tree, followed by the bits of the cell. All cells of the first trees
-            come first; cells of other trees follow in increasing order if they have a sample. An
-            entry before these has sums of zero.
-        value, square, weight: Of contributions, of their squares and of weights, in units.
-    """
-
-    key: mi.UInt32
-    value: mi.UInt64
-    square: mi.UInt64
-    weight: mi.UInt64
-
-    @property
-    def sums(self) -> list[mi.UInt64]:
-        """The three running sums."""
-        return [self.value, self.square, self.weight]
-
-    @classmethod
-    def of(
-        cls,
-        code: mi.UInt32,
-        value: mi.Float,
-        weight: mi.Float,
-        tree: mi.UInt32,
-        parent: mi.UInt32 | None = None,
-        levels: Sequence[slice] = (slice(0, 0),),
-    ) -> Cells:
-        """The cells of primary samples, in their trees and in the trees of their surroundings.
-
-        Parameters:
-            code: The cell of each primary sample; see :func:`cell_code`.
-            value: Contribution of the path, divided by the density of the sample.
-            weight: 1 / density of the sample.
-            tree: The smallest tree to which the sample belongs.
-            parent: For each tree, the tree of its surroundings, which is of an earlier level.
-            levels: The trees of each level. All cells are stored for all levels except the last
-                one, where few cells of a tree have a sample.
-        """
-        cells = _cells_of(code, value, weight, tree, levels[-1].start << DEPTH)
-        if levels[-1].start > 0:
-            cells._surround(parent, levels)
-        return cells
-
-    @dr.syntax
-    def lower_bound(self, key: mi.UInt32, first: mi.UInt32, last: mi.UInt32) -> mi.UInt32:
-        """The first cell of [first, last) whose key is not below ``key``."""
-        first, last = mi.UInt32(first), mi.UInt32(last)
-        while first < last:
-            middle = (first + last) >> 1
-            is_below = dr.gather(mi.UInt32, self.key, middle) < key
-            first = dr.select(is_below, middle + 1, first)
-            last = dr.select(is_below, last, middle)
-        return first
-
-    def between(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
-        """The sums over [begin, end)."""
-        return [
-            dr.gather(mi.UInt64, x, end - 1, end > 0)
-            - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
-            for x in self.sums
-        ]
-
-    def _surround(self, parent: mi.UInt32, levels: Sequence[slice]) -> None:
-        """Sets the running sums of surroundings, from small ones to large ones."""
-        rows, trees = (dr.opaque(mi.UInt32, x) for x in (levels[-1].start, levels[-1].stop))
-        count = levels[-1].start << DEPTH
-        table = [dr.zeros(mi.UInt64, count) for _ in range(3)]
-
-        def around(key: mi.UInt32) -> mi.UInt32:
-            tree = dr.gather(mi.UInt32, parent, key >> DEPTH)
-            return (tree << DEPTH) | (key & ((1 << DEPTH) - 1))
-
-        def add(key: mi.UInt32, sums: list[mi.UInt64], active: mi.Bool) -> None:
-            for target, x in zip(table, sums):
-                dr.scatter_add(target, x, key, active & (x > 0), mode=dr.ReduceMode.Direct)
-            dr.eval(table)
-
-        place = dr.arange(mi.UInt32, len(self.key) - count - 1) + (rows << DEPTH) + 1
-        key = dr.gather(mi.UInt32, self.key, place)
-        tree = key >> DEPTH
-        key = dr.select(tree < rows, key, around(key))
-        sums = self.between(place, place + 1)
-        add(key, sums, tree < trees)
-        for level in reversed(levels[1:-1]):
-            if level.start == level.stop:
-                continue
-            key = dr.arange(mi.UInt32, (level.stop - level.start) << DEPTH)
-            key += dr.opaque(mi.UInt32, level.start << DEPTH)
-            sums = [dr.gather(mi.UInt64, x, key) for x in table]
-            # Read before the table changes
-            dr.eval(sums)
-            add(around(key), sums, mi.Bool(True))
-        del sums
-        running = [dr.cumsum(table.pop(0)) for _ in range(3)]
-        key = dr.arange(mi.UInt32, count)
-        for target, x in zip((self.key, *self.sums), (key, *running)):
-            _write(target, x, key)
-        dr.eval(self)
-
-
-def _cells_of(code, value, weight, tree, before: int) -> Cells:
-    """The cells that have samples, in order, after a number of places that are not set yet."""
-    # In double precision, so that the order of the samples does not matter. Opaque: other
-    # counts share the kernel
-    count = dr.opaque(mi.UInt32, len(value))
-    scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / mi.Float64(count), 1e-30))
-    key = (tree << DEPTH) | code
-    order = dr.argsort(key)
-    key = dr.gather(mi.UInt32, key, order)
-    # The largest of n values is at most n times their mean
-    value = dr.minimum(mi.Float64(dr.gather(mi.Float, value, order)) * scale, _LIMIT)
-    weight = mi.Float64(dr.gather(mi.Float, weight, order))
-    fixed = [mi.UInt64(x * y) for x, y in zip((value, dr.square(value), weight), _UNITS)]
-    # The last sample of each cell
-    index = dr.arange(mi.UInt32, len(key))
-    following = dr.gather(mi.UInt32, key, index + 1, index + 1 < count)
-    is_last = (index + 1 == count) | (key != following)
-    # Evaluated together: each of them alone would be a kernel of its own
-    dr.eval(key, fixed, is_last)
-    running = [dr.cumsum(x) for x in fixed]
-    last = dr.compress(is_last)
-    cell = dr.arange(mi.UInt32, 1 + len(last))
-    is_cell = cell > 0
-    sample = dr.gather(mi.UInt32, last, cell - 1, is_cell)
-    # An entry of zeros stands before the first cell
-    key = dr.gather(mi.UInt32, key, sample)
-    key = dr.select(is_cell, key, dr.maximum(key, 1) - 1)
-    size = before + 1 + len(last)
-    cells = Cells(*_empty(mi.UInt32, size, 1), *_empty(mi.UInt64, size, 3))
-    place = cell + dr.opaque(mi.UInt32, before)
-    _write(cells.key, key, place)
-    for target, x in zip(cells.sums, running):
-        _write(target, dr.gather(mi.UInt64, x, sample, is_cell), place)
-    dr.eval(cells)
-    return cells
 
 
 @dataclass
@@ -240,15 +87,15 @@ class _Growth:
     def __init__(self, cells: Cells, prior: mi.UInt32, forests: int, whole: int) -> None:
         self._cells, self._forests = cells, forests
         tree = dr.arange(mi.UInt32, len(prior))
-        whole, last, count = (
+        whole, last, size = (
             dr.opaque(mi.UInt32, x) for x in (whole, len(prior) - 1, len(cells.key))
         )
-        is_whole = tree < whole
-        begin = cells.lower_bound(tree << DEPTH, whole << DEPTH, count)
-        begin = dr.select(is_whole, tree << DEPTH, begin)
+        self._first_whole = size
+        is_whole, place = tree < whole, size + (tree << DEPTH)
+        begin = cells.lower_bound(tree << DEPTH, mi.UInt32(0), size)
         dr.eval(begin)
         end = dr.gather(mi.UInt32, begin, dr.minimum(tree + 1, last))
-        end = dr.select(is_whole, (tree + 1) << DEPTH, end)
+        begin, end = dr.select(is_whole, place, begin), dr.select(is_whole, place + CELLS, end)
         value, square, _weight = self._sums(begin, end)
         roots = _Level(begin, end, tree << DEPTH, _evidence(value, square))
         roots.twin = dr.select(prior == tree, _NONE, prior)
@@ -268,7 +115,10 @@ class _Growth:
             dr.gather(mi.UInt32, x, splits) for x in (level.begin, level.end, level.key)
         )
         middle_key = key | dr.opaque(mi.UInt32, 1 << (DEPTH - depth))
-        middle = self._cells.lower_bound(middle_key, begin, end)
+        # Where all cells are stored, the middle is known
+        is_whole = begin >= self._first_whole
+        middle = self._cells.lower_bound(middle_key, begin, dr.select(is_whole, begin, end))
+        middle = dr.select(is_whole, (begin + end) >> 1, middle)
         value_l, square_l, weight_l = self._sums(begin, middle)
         value_r, square_r, weight_r = self._sums(middle, end)
         mean_l, mean_r = value_l / dr.maximum(weight_l, 1), value_r / dr.maximum(weight_r, 1)
@@ -277,7 +127,8 @@ class _Growth:
         left, count = 2 * dr.arange(mi.UInt32, len(splits)), 2 * len(splits)
         evidence = dr.gather(mi.Float, level.evidence, splits)
         share = mi.Point2f(found * evidence, _PRIOR) / (evidence + _PRIOR)
-        new = _Level(*_empty(mi.UInt32, count, 3), dr.empty(mi.Float, count))
+        kinds = mi.UInt32, mi.UInt32, mi.UInt32, mi.Float
+        new = _Level(*(dr.empty(kind, count) for kind in kinds))
         around = dr.empty(mi.UInt32, count)
         evidence_l, evidence_r = _evidence(value_l, square_l), _evidence(value_r, square_r)
         level.split(splits, left, share, prior)
@@ -285,8 +136,8 @@ class _Growth:
             (new.begin, begin, middle), (new.end, middle, end), (new.key, key, middle_key),
             (new.evidence, evidence_l, evidence_r), (around, prior, prior),
         ):  # fmt: skip
-            _write(target, of_left, left)
-            _write(target, of_right, left + 1)
+            put(target, of_left, left)
+            put(target, of_right, left + 1)
         dr.eval(level.links, level.shares, new.begin, new.end, new.key, new.evidence, around)
         has_twin = around != _NONE
         side = dr.arange(mi.UInt32, new.count) & 1
@@ -358,7 +209,7 @@ class _Growth:
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
         """The sums of values, squares and weights of the cells [begin, end)."""
         found = self._cells.between(begin, end)
-        return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
+        return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, UNITS)]
 
 
 class _Level:
@@ -378,8 +229,8 @@ class _Level:
         self.links = dr.empty(mi.UInt32, 2 * self.count)
         self.shares = dr.empty(mi.Float, 2 * self.count)
         for index, (link, x) in enumerate(zip((first, prior), share)):
-            _write(self.links, link, 2 * splits + index)
-            _write(self.shares, x, 2 * splits + index)
+            put(self.links, link, 2 * splits + index)
+            put(self.shares, x, 2 * splits + index)
 
     def link(self, node: mi.UInt32, active: mi.Bool) -> mi.Vector2u:
         """The left child of a node that is split, and the node that is its prior."""
@@ -396,36 +247,6 @@ class _Level:
             node = dr.select(is_split, node, dr.gather(mi.UInt32, self.twin, node))
             active = ~is_split & (node != _NONE)
         return node
-
-
-def cell_code(u: mi.Point2f) -> mi.UInt32:
-    """The number of the smallest cell that contains a sample of [0, 1)². Its first (highest) bit is
-    the side of the first split, and so on."""
-    cell = mi.Vector2u(u * (1 << DEPTH // 2))
-    code = mi.UInt32(0)
-    for level in range(DEPTH):
-        axis, bit = level % 2, DEPTH // 2 - 1 - level // 2
-        code = (code << 1) | ((cell[axis] >> bit) & 1)
-    return code
-
-
-def cell_centre(code: mi.UInt32) -> mi.Point2f:
-    """The middle of a cell."""
-    u = mi.Point2f(2.0 ** -(DEPTH // 2 + 1))
-    for level in range(DEPTH):
-        bit = (code >> (DEPTH - 1 - level)) & 1
-        u[level % 2] += dr.select(bit == 1, 0.5 ** (level // 2 + 1), 0.0)
-    return u
-
-
-def _write(target: mi.UInt32 | mi.UInt64 | mi.Float, value: Any, place: mi.UInt32) -> None:
-    """Writes to places, no two of which are the same. Without this promise, a second ``dr.scatter``
-    to the array would evaluate the first one: two kernels instead of one."""
-    dr.scatter(target, value, place, mode=dr.ReduceMode.Permute)
-
-
-def _empty(kind: type, count: int, arrays: int) -> list[Any]:
-    return [dr.empty(kind, count) for _ in range(arrays)]
 
 
 def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.planning.pixel_estimates import PixelEstimates
+from mitsuba_ext.techniques.guided_directions.cells import cell_code
 from mitsuba_ext.techniques.guided_directions.path_records import PathRecords
 from mitsuba_ext.techniques.guided_directions.sample_trees import LEAF, SampleTrees
 from mitsuba_ext.techniques.guided_directions.surface_regions import SurfaceRegions
 from mitsuba_ext.techniques.guided_directions.tile_regions import TileRegions
-from mitsuba_ext.techniques.guided_directions.tree_builder import cell_code
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk
