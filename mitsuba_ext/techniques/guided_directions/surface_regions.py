@@ -132,7 +132,7 @@ class SurfaceRegions:
         sums = dr.zeros(mi.UInt64, 3 * self.tree_count)
         for index, x in enumerate((*units, mi.UInt64(1))):
             place = 3 * records.region + index
-            dr.scatter_add(sums, x, place, mode=dr.ReduceMode.Direct)
+            dr.scatter_add(sums, x, place, x > 0, mode=dr.ReduceMode.Direct)
         dr.eval(sums, means)
         unit = [float(mean[0]) / _UNITS for mean in means]
         return sums.numpy().reshape(-1, 3).T * np.array([*unit, 1.0])[:, None]
