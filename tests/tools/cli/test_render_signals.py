@@ -16,7 +16,7 @@ import pytest
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import read_exr
 from mitsuba_ext.images import image_files
-from mitsuba_ext.rendering import interrupts, plan, seed_passes
+from mitsuba_ext.rendering import device, interrupts, plan, seed_passes
 from mitsuba_ext.rendering import render as rendering
 
 
@@ -64,11 +64,13 @@ def test_render_interrupted_before_its_first_pass_leaves_an_older_file_alone(
 def third_pass_gets(request, monkeypatch):
     """What makes every third pass of 4 samples get signals, 10 ms from each other; returns the
     integrator."""
-    job, name, lengths = {
-        "path": (seed_passes.SeedPasses, "_run_pass", seed_passes),
-        "composed_path": (rendering.Job, "run_pass", plan),
-    }[request.param]  # fmt: skip
-    monkeypatch.setattr(lengths, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
+    samples = 4 * 8 * 6
+    if request.param == "path":
+        job, name, lengths = seed_passes.SeedPasses, "_run_pass", seed_passes
+        monkeypatch.setattr(seed_passes, "_PASS_SAMPLES", {dr.JitBackend.LLVM: samples})
+    else:
+        job, name, lengths = rendering.Job, "run_pass", plan
+        monkeypatch.setattr(device, "_CPU_SAMPLES", samples)
     monkeypatch.setattr(lengths, "_PASS_SPP", 1)
     run_pass, passes = getattr(job, name), []
 

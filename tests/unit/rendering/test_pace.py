@@ -207,7 +207,7 @@ def test_learning_begins_only_where_there_is_time_to_compile():
 
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
 def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
-    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     scene, compiled = _scene(), []
     for spp in (32, 64, 48, 80):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -252,7 +252,7 @@ def passes_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("sampler", ["independent", "multijitter"])
 @pytest.mark.parametrize("name", ["composed_path", "neepp", "auto", "bdpt"])
 def test_passes_of_whole_warps_take_all_samples(scene, name, sampler, monkeypatch):
-    monkeypatch.setattr(verdicts, "LEAST_SAMPLES", 0)
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
     integrator, told = _path(name), []
