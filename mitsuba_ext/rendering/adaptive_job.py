@@ -164,7 +164,7 @@ class AdaptiveJob(Job):
 
 
 def _pixels(ends: mi.UInt32, number: mi.UInt32) -> mi.UInt32:
-    """The pixel of each set: those of pixel i end before number ``ends[i]``."""
+    """The pixel of each set: the sets of pixel i end before number ``ends[i]``."""
     last = dr.opaque(mi.UInt32, len(ends))
     longest = 1 << 8 * -(-len(ends).bit_length() // 8)  # few different numbers of steps
     pixels = first_above(ends, mi.UInt32(0), last, number, mi.Bool(True), longest)

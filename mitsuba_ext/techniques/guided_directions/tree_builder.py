@@ -54,7 +54,7 @@ class Nodes:
         return len(self.child)
 
     def followed_by(self, other: Nodes) -> Nodes:
-        """These nodes, then those of other trees."""
+        """These nodes, then the nodes of other trees."""
         child = other.child + dr.opaque(mi.UInt32, self.count)
         return joined([self, Nodes(other.probability, child, other.is_even)])
 
