@@ -155,8 +155,10 @@ def plan_render(
 
 def whole_warps(samples: int, warp: int) -> int:
     """The number of samples per pixel, rounded down so that warps are not split between pixels: to
-    a multiple of ``warp``, or a power of two below it."""
-    return samples - samples % warp if samples >= warp else 1 << (samples.bit_length() - 1)
+    a multiple of ``warp``, or a power of two below it. 0 if there are no samples."""
+    if samples >= warp:
+        return samples - samples % warp
+    return 1 << (samples.bit_length() - 1) if samples > 0 else 0
 
 
 def _divides(length: int, spp: int, set_size: int) -> bool:

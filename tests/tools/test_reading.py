@@ -52,4 +52,6 @@ def test_few_files_take_part_in_a_sample(name: str, spp: int, most: int) -> None
             sys.setprofile(None)
     own = [ROOT / "mitsuba_ext", ROOT / "integrators"]
     files = {str(file) for file in reader.files if any(map(file.is_relative_to, own))}
+    # The count is worth nothing if it misses the walk
+    assert str(ROOT / "mitsuba_ext" / "transport" / "walk.py") in files
     assert len(files) <= most, "\n".join(sorted(files))

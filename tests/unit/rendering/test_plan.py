@@ -12,7 +12,7 @@ import pytest
 from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_both_paths
 from mitsuba_ext.rendering import device as devices
 from mitsuba_ext.rendering.device import Device, device_of, look_again
-from mitsuba_ext.rendering.plan import RenderPlan, plan_render
+from mitsuba_ext.rendering.plan import RenderPlan, plan_render, whole_warps
 from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.util.memory import Memory
 from tests.support.paths import ROOT
@@ -196,3 +196,11 @@ def test_auto_tries_light_paths_where_memory_has_room_for_all_pixels(
         Request(scene, scene.sensors()[0], 0, 256), 256
     )
     assert (learning.trial is not None) == tries
+
+
+@pytest.mark.parametrize(
+    ("samples", "warp", "length"),
+    [(100, 32, 96), (32, 32, 32), (31, 32, 16), (1, 32, 1), (0, 32, 0), (7, 1, 7), (0, 1, 0)],
+)
+def test_warps_are_not_split_between_pixels(samples: int, warp: int, length: int) -> None:
+    assert whole_warps(samples, warp) == length

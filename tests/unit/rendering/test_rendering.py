@@ -10,36 +10,28 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning import verdicts
 from mitsuba_ext.rendering import device, interrupts, plan
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.request import Request
-from mitsuba_ext.rendering.stages import Learning, Schedule, Stage
+from mitsuba_ext.rendering.stages import Stage
 from mitsuba_ext.transport.estimator import Sample
 from tests.support.clock import PassClock
+from tests.support.constant_renders import (
+    HEIGHT,
+    WIDTH,
+    Constant,
+    FixedSchedule,
+    TwoStages,
+    small_scene,
+)
 from tests.support.stage import stage
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-WIDTH, HEIGHT = 12, 8
-
 
 @pytest.fixture
 def scene(variant: str) -> mi.Scene:
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT,
-                         "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": 5},
-            },
-            "sphere": {"type": "sphere"},
-            "lamp": {"type": "point", "position": [2, 3, 4]},
-        }
-    )
+    return small_scene()
 
 
 @pytest.fixture
@@ -50,73 +42,12 @@ def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan, "_PASS_SPP", 1)
 
 
-class _Constant:
-    """An estimator whose every sample is worth the same."""
-
-    def __init__(self, value: float, can_be_frozen: bool = False) -> None:
-        self.value, self.can_be_frozen = value, can_be_frozen
-
-    def __call__(self, scene, sampler, rays, active):
-        zero = dr.zeros(mi.UInt32, dr.width(rays.ray))
-        return Sample(mi.Color3f(self.value), mi.Bool(True), zero, zero, zero)
-
-
-class _Schedule(Schedule):
-    """Stages that are there beforehand."""
-
-    def __init__(self, *stages: Stage) -> None:
-        self._stages = iter(stages)
-
-    def next_stage(self) -> Stage:
-        return next(self._stages)
-
-    def divide_first_stage(self, pixel_count: int) -> int:
-        return 1
-
-    def end_learning(self) -> None:
-        pass
-
-    def finish(self, statistics) -> None:
-        pass
-
-
-class _TwoStages:
-    """Two stages of constants: a pilot worth 1 and a rest worth 3."""
-
-    def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
-        self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
-        self.is_cancelled = False
-        self.name, self.sample_cost, self.sample_bytes = "two_stages", 1, device.SampleBytes()
-
-    def plan_learning(self, request, spp):
-        return Learning((self.pilot_spp,))
-
-    def samples_per_set(self, spp):
-        return 1
-
-    def pace_stage(self, request, spp):
-        return None
-
-    def schedule(self, request, samples, learning):
-        return _Schedule(Stage(_Constant(1.0)), Stage(_Constant(3.0), "something"))
-
-    def aov_names(self):
-        return []
-
-    def sample_aovs(self, scene, sampler, ray):
-        return []
-
-    def render(self, scene, spp, **rest):
-        request = Request(scene, scene.sensors()[0], 0, spp, timeout=self.timeout)
-        return rendering.render(self, request).numpy()
-
-
 @pytest.mark.parametrize("can_be_frozen", [False, True])
 def test_samples_of_a_stage_count_in_the_film_as_its_weight_says(scene, can_be_frozen):
-    class Weighted(_TwoStages):
+    class Weighted(TwoStages):
         def schedule(self, request, samples, learning):
-            first, second = (_Constant(value, can_be_frozen) for value in (1.0, 3.0))
-            return _Schedule(Stage(first, weight=0.25), Stage(second))
+            first, second = (Constant(value, can_be_frozen) for value in (1.0, 3.0))
+            return FixedSchedule(Stage(first, weight=0.25), Stage(second))
 
     for _ in range(2):
         image = Weighted(pilot_spp=8).render(scene, spp=12)
@@ -175,9 +106,9 @@ class _Recorder:
 @pytest.mark.parametrize("sampler", ["independent", "multijitter", "sobol_owen"])
 def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scene, sampler):
     """Each pixel has all of its samples, and all of them have numbers of their own."""
-    estimator, integrator = _Recorder(), _TwoStages(pilot_spp=1)
+    estimator, integrator = _Recorder(), TwoStages(pilot_spp=1)
     integrator.sample_bytes = device.SampleBytes(device.device_of(mi.Float).pass_bytes / 40)
-    integrator.schedule = lambda *rest: _Schedule(Stage(estimator), Stage(estimator))
+    integrator.schedule = lambda *rest: FixedSchedule(Stage(estimator), Stage(estimator))
     sensor = mi.load_dict({
         "type": "perspective", "sampler": {"type": sampler},
         "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}},
@@ -193,7 +124,7 @@ def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scen
 
 @pytest.mark.usefixtures("small_passes")
 def test_pilot_samples_weigh_as_much_as_the_others(scene):
-    integrator = _TwoStages(pilot_spp=3)
+    integrator = TwoStages(pilot_spp=3)
     image = integrator.render(scene, 20)
     assert image == pytest.approx((3 * 1 + 17 * 3) / 20)
     assert integrator.statistics.spp == 20 and integrator.statistics.learned == "something"
@@ -207,7 +138,7 @@ def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
     """Stratified samplers too, whose count cannot be cut freely."""
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
-    integrator = _TwoStages(pilot_spp=3)
+    integrator = TwoStages(pilot_spp=3)
     integrator.spp = 64
     rendering.render(integrator, Request(scene, sensor, 0, 64))
     expected = mi.load_dict({"type": sampler})
@@ -225,7 +156,7 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     for name in ("_CPU_SAMPLES", "_GPU_SAMPLES"):
         monkeypatch.setattr(device, name, 8 * WIDTH * HEIGHT)
     clock = PassClock(monkeypatch)
-    integrator = _TwoStages(pilot_spp=25)
+    integrator = TwoStages(pilot_spp=25)
     request = Request(scene, sensor, 0, 144, timeout=timeout)
     image = rendering.render(integrator, request).numpy()
     done = integrator.statistics.spp
@@ -241,56 +172,9 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     assert pilot <= 0.25 * done + 2
 
 
-@pytest.fixture
-def passes_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At most 64 samples per pixel and pass, in whole warps."""
-    gpu = device.Device(True, 64 * WIDTH * HEIGHT * 128)
-    monkeypatch.setattr(rendering, "device_of", lambda kind: gpu)
-
-
-@pytest.mark.usefixtures("passes_of_a_gpu")
-@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
-@pytest.mark.parametrize("name", ["composed_path", "neepp", "auto", "bdpt"])
-def test_passes_of_whole_warps_take_all_samples(scene, name, sampler, monkeypatch):
-    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
-    sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
-                           "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
-    integrator, told = _path(name), []
-    integrator.progress = told.append
-    assert np.isfinite(integrator.render(scene, sensor, spp=100).numpy()).all()
-    assert integrator.statistics.spp == 100
-    assert told == sorted(told) and told[-1] == 1
-
-
-@pytest.mark.usefixtures("passes_of_a_gpu")
-@pytest.mark.parametrize("timeout", [3.0, 8.0, 1000.0])
-def test_passes_of_whole_warps_keep_the_timeout(scene, monkeypatch, timeout):
-    clock = PassClock(monkeypatch)
-    integrator = _TwoStages(pilot_spp=25, timeout=timeout)
-    integrator.render(scene, 144)
-    assert integrator.statistics.spp == round(clock.now / 0.1)
-    assert integrator.statistics.spp == 144 or timeout * 0.9 <= clock.now <= timeout * 1.05
-
-
-@pytest.mark.usefixtures("passes_of_a_gpu")
-@pytest.mark.parametrize("name", ["adaptive", "variance"])
-def test_passes_of_whole_warps_serve_adaptive_sampling_and_variances(scene, name):
-    nested = {"type": "composed_path", "max_depth": 3}
-    image = mi.load_dict({"type": name, "nested": nested}).render(scene, spp=200).numpy()
-    assert np.isfinite(image).all() and image.max() > 0
-
-
-@pytest.mark.usefixtures("passes_of_a_gpu")
-def test_a_render_in_whole_warps_can_be_cancelled(scene):
-    integrator = _path()
-    integrator.progress = lambda fraction: integrator.cancel()
-    integrator.render(scene, spp=200)
-    assert integrator.statistics.interrupted and integrator.statistics.spp == 64
-
-
 def test_compilation_counts_towards_the_timeout_but_not_as_speed(scene, monkeypatch):
     clock = PassClock(monkeypatch, compiling=1)
-    integrator = _TwoStages(pilot_spp=4, timeout=9.0)
+    integrator = TwoStages(pilot_spp=4, timeout=9.0)
     integrator.render(scene, 1000)
     assert clock.now == pytest.approx(9.0, rel=0.05)
     clock = PassClock(monkeypatch, compiling=1)

@@ -49,10 +49,10 @@ def test_a_pass_launches_few_kernels(
     name: str, depth: int, kernels: int, all_launches: int
 ) -> None:
     found = launches(name, 32, depth)
-    assert found["JIT"] <= kernels, found
+    assert 0 < found["JIT"] <= kernels, found
     assert sum(found.values()) - sum(found[k] for k in OTHER) <= all_launches, found
 
 
 def test_larger_films_need_no_more_launches() -> None:
     small, large = (launches("bdpt", size, 8) for size in (32, 64))
-    assert small["JIT"] == large["JIT"] and small["Memcpy"] == large["Memcpy"]
+    assert small["JIT"] == large["JIT"] > 0 and small["Memcpy"] == large["Memcpy"] > 0
