@@ -95,6 +95,19 @@ def test_the_variance_of_sets_is_the_variance_of_their_means():
     assert moments.deviation()[0] == 0 and moments.count[0] == moments.total == 32
 
 
+@pytest.mark.parametrize(("x", "y"), [(2, 1), (0, 0), (4, 3)])
+def test_a_pixel_shares_its_variance_with_those_around_it(x: int, y: int) -> None:
+    width, height = 5, 4
+    moments = PixelMoments(width, height)
+    pixels = np.repeat(np.arange(width * height), 2)
+    values = np.where(pixels == y * width + x, np.tile([0.0, 1.0], width * height), 0)
+    moments.add(mi.UInt32(pixels), mi.Float(values))
+    rows, columns = np.indices((height, width))
+    is_near = (abs(rows - y) <= 1) & (abs(columns - x) <= 1)
+    found = moments.deviation().numpy().reshape(height, width)
+    np.testing.assert_array_equal(found > 0, is_near)
+
+
 def test_a_black_image_gets_equal_samples():
     moments = PixelMoments(4, 4)
     allocation = SampleAllocation(moments, 64, 8)
