@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering import device, plan
 from mitsuba_ext.rendering.pixel_moments import PixelMoments
 from mitsuba_ext.rendering.sample_allocation import SampleAllocation
 from mitsuba_ext.rendering.statistics import kernel_cache_misses
@@ -116,6 +117,19 @@ def test_a_black_image_gets_equal_samples():
 
 
 # ---- Renders ----
+
+
+def test_a_pass_in_parts_samples_every_pixel(monkeypatch):
+    """Each pixel sees the same sky, and therefore gets the same number of samples."""
+    monkeypatch.setattr(device, "_CPU_SAMPLES", 100)
+    monkeypatch.setattr(plan, "_PASS_SPP", 1)
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": 2.0}})
+    sensor = mi.load_dict({"type": "perspective", "film": film(16, 12)})
+    integrator = adaptive(count_samples=True)
+    image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=16))
+    np.testing.assert_allclose(image[..., :3], 2, rtol=1e-5)
+    np.testing.assert_array_equal(np.round(image[..., 3]), 16)
+    assert integrator.statistics.passes > 8  # the default
 
 
 def _rare_lamp() -> mi.Scene:
