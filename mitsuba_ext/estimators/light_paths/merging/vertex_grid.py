@@ -42,7 +42,7 @@ class Counted(NamedTuple):
     counts: mi.UInt32
 
 
-class Cells:
+class HashedGrid:
     """A regular grid. Its cells are numbered by a hash, so that memory does not depend on the size
     of the scene.
 
@@ -75,7 +75,7 @@ class Cells:
         return mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale))
 
 
-class VertexCounts(Cells):
+class VertexCounts(HashedGrid):
     """The number of vertices in each cube of a grid, two radii wide. There must be few vertices,
     because buckets are counted as cells.
 
@@ -113,7 +113,7 @@ class VertexCounts(Cells):
         return float(counts[np.searchsorted(vertices, 0.5 * vertices[-1])]) - 1
 
 
-class VertexGrid(Cells):
+class VertexGrid(HashedGrid):
     """The vertices, sorted by the cell of a regular grid that they lie in.
 
     The order of the vertices in a cell depends on threads; sums over them therefore differ from run
