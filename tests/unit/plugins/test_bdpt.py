@@ -168,9 +168,11 @@ def test_a_pass_traces_each_walk_once() -> None:
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         bdpt(8).render(scene, spp=16, seed=1)
-        kernels = [k for k in dr.kernel_history() if k.get("operation_count", 0) > 500]
-    # The light walk, the camera walk
-    assert len({k["hash"] for k in kernels if k["size"] == lanes}) == 2
+        kernels = [k for k in dr.kernel_history() if k["size"] == lanes and "hash" in k]
+    # The light walk, the camera walk. The kernel of splats has a quarter of their operations; all
+    # have more where other scenes are in memory
+    most = max(k["operation_count"] for k in kernels)
+    assert len({k["hash"] for k in kernels if k["operation_count"] > most / 2}) == 2
 
 
 @pytest.mark.parametrize("shape", ["bsplinecurve", "sdfgrid"])
