@@ -9,6 +9,7 @@ import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -101,11 +102,10 @@ class Workers(Executor):
 
     def _killed(self, number: int) -> WorkerKilledError | None:
         """Says how a process was killed; ``None`` if it was not."""
-        process = self._processes[number]
-        process.join(_TIMEOUT)
-        if process.exitcode not in _KILL_CODES:
+        exit_code = _exit_code(self._processes[number])
+        if exit_code not in _KILL_CODES:
             return None
-        name = signal.Signals(-process.exitcode).name
+        name = signal.Signals(-exit_code).name
         return WorkerKilledError(
             f"its process was killed ({name}), by a user or because memory ran out"
         )
@@ -122,6 +122,18 @@ class Workers(Executor):
         future = pool.submit(function, *arguments, **options)
         (self._processes[number],) = pool._processes.values()
         return future
+
+
+def _exit_code(process: BaseProcess) -> int | None:
+    """The exit code of a process whose pool is broken; ``None`` if it is still unknown after some
+    seconds."""
+    end = time.monotonic() + _TIMEOUT
+    process.join(_TIMEOUT)
+    # The pool waits for the process too. If the pool's thread is told of the end and has not stored
+    # the exit code yet, the process has already ended and has no exit code
+    while (code := process.exitcode) is None and time.monotonic() < end:
+        time.sleep(0.01)
+    return code
 
 
 def _start(parent: int) -> None:

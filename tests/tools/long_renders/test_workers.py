@@ -284,6 +284,22 @@ def test_a_dying_process_costs_its_task_and_a_hanging_one_ends_with_the_others()
         assert time.monotonic() - begin < 30
 
 
+def test_the_exit_code_of_a_process_may_arrive_after_its_end():
+    """The pool's thread may have been told of the end without having stored the code yet."""
+
+    class Ended:
+        codes = [None, None, -signal.SIGKILL]
+        exitcode = property(lambda process: process.codes.pop(0))
+
+        def join(self, timeout):
+            pass
+
+    workers = Workers(1)
+    workers._processes[0] = Ended()
+    assert "SIGKILL" in str(workers._killed(0))
+    workers.shutdown()
+
+
 @pytest.mark.parametrize(("error", "deaths"), [
     (WorkerKilledError("killed"), 10), (BrokenProcessPool("died"), 3)
 ])  # fmt: skip
