@@ -51,6 +51,10 @@ _CPU_SAMPLES, _GPU_SAMPLES = 1 << 21, 1 << 26
 #: Bytes of a sample of a camera path on a GPU, about, with what learners record.
 _CAMERA_BYTES = 128
 
+#: Bytes of a sample of a camera path on a CPU (the state of its random numbers before and after the
+#: pass), and the memory for them in units of the memory of a pass, a quarter of the whole.
+_STATE_BYTES, _STATE_MEMORY = 24, 7
+
 #: Lanes that a GPU runs together. If they are samples of one pixel, they trace coherent rays, and
 #: Dr.Jit can add them to the film as one sum.
 _WARP = 32
@@ -104,6 +108,13 @@ class Device:
         if not self.is_gpu:
             return _CPU_SAMPLES
         return min(_GPU_SAMPLES, self.lanes(SampleBytes(_CAMERA_BYTES)))
+
+    @property
+    def most_pass_samples(self) -> int:
+        """The most samples that a pass may have, if they store no more than paths."""
+        if self.is_gpu:
+            return self.pass_samples
+        return min(_MAX_WAVEFRONT - 1, _STATE_MEMORY * self.pass_bytes // _STATE_BYTES)
 
     @property
     def warp(self) -> int:

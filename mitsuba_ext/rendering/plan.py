@@ -18,7 +18,8 @@ from .stages import Learning
 
 #: Least number of samples per pixel in a pass on a CPU, also for large films: neighbouring lanes of
 #: the same pixel trace coherent rays. At 1920x1080, passes of one sample take 1.6 times as long. It
-#: does not apply to structured samplers, which keep a state for each sample of a pass.
+#: does not apply where memory is short, nor to structured samplers, which keep a state for each
+#: sample of a pass.
 _PASS_SPP = 16
 
 #: Least number of passes if an integrator that learns uses a structured sampler: pilots consist of
@@ -122,7 +123,7 @@ def plan_render(
     cost, most_lanes = integrator.sample_cost, device.lanes(integrator.sample_bytes)
     limit = device.pass_samples // (pixel_count * cost)
     if not structured and not device.is_gpu:
-        limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
+        limit = max(limit, min(_PASS_SPP // cost, device.most_pass_samples // pixel_count))
     if structured and request.is_timed:
         limit //= _TIMEOUT_PASS_DIVISOR
     limit = min(limit, integrator.samples_per_pass, most_lanes // pixel_count)

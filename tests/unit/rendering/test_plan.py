@@ -103,6 +103,13 @@ def test_memory_that_former_renders_hold_is_given_back_where_little_is_free(monk
     assert len(flushed) == 1, "once in a render"
 
 
+@pytest.mark.parametrize(("total", "length"), [(23.4, 16), (3.8, 4), (1, 1)])
+def test_passes_of_a_large_film_fit_into_a_quarter_of_the_memory(total: float, length: int) -> None:
+    """A sample stores 24 bytes. At 3840x2160, passes of 16 samples would take 3 GiB."""
+    plan = _plan(_device(False, total), "composed_path", (3840, 2160), 64)
+    assert plan.pass_length(64) == length
+
+
 def test_bidirectional_passes_on_a_large_gpu_are_few() -> None:
     """They were 384 runs, of 300 000 lanes each."""
     plan = _plan(H100, "bdpt", (1280, 720), 128)
