@@ -6,7 +6,7 @@ The table has FLIP, and relMSE in brackets, the means over seeds: of the image, 
 denoised by Open Image Denoise with no guides, with Mitsuba's ``eval_diffuse_reflectance`` (clipped)
 as the albedo, and with the albedo of ``render_guides``. Scenes of the papers have their references
 beside them (``max_depth`` 6); those of our scenes are rendered by ``auto`` first and kept in
-``out/denoiser_guides``.
+``out/denoiser_guides``. ``--picture`` writes the two albedos of the last scene, side by side.
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ def images(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
 @click.command()
 @click.argument("scenes", nargs=-1, required=True)
 @click.option("--spp", default="16,64", show_default=True)
-@click.option("--seeds", default=2, show_default=True)
-def main(scenes: tuple[str, ...], spp: str, seeds: int) -> None:
+@click.option("--seeds", default=3, show_default=True)
+@click.option("--picture", metavar="FILE")
+def main(scenes: tuple[str, ...], spp: str, seeds: int, picture: str | None) -> None:
     """Compares on SCENES."""
     mi.set_variant("llvm_ad_rgb")
     columns = ("image", "no guides", "Mitsuba's albedo", "albedo")
@@ -82,13 +83,16 @@ def main(scenes: tuple[str, ...], spp: str, seeds: int) -> None:
                 image = mi.render(scene, integrator=integrator, seed=100 + seed, spp=count)
                 image = np.array(image)[..., :3]
                 made = (image, *(denoise(image, *way) for way in ways))
-                for column, picture in zip(found, made):
-                    column.append(errors(picture, reference.mean, reference.variance))
+                for column, result in zip(found, made):
+                    column.append(errors(result, reference.mean, reference.variance))
             cells = (
                 f"{np.mean([e.flip for e in es]):.4f} ({np.mean([e.relmse for e in es]):.2g})"
                 for es in found
             )
             print(f"| {title(name)} | {count} | {' | '.join(cells)} |", flush=True)
+    if picture:
+        both = np.concatenate([before[0], np.ones_like(before[0][:, :8]), ways[2][0]], axis=1)
+        mi.util.write_bitmap(picture, mi.TensorXf(both), write_async=False)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ def comparison_wavelengths(width: int) -> mi.Spectrum:
 
 def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
     """Radiance as the colour that films store."""
+    L = mi.unpolarized_spectrum(L)
     if mi.is_spectral:
         return mi.spectrum_to_srgb(L, wavelengths)
     return mi.Color3f(L.x) if mi.is_monochromatic else L

@@ -159,6 +159,63 @@ def test_guides_show_the_objects_behind_glass_and_holes():
     assert (_guides({"type": "sphere", "center": [9, 9, 9]}) == 0).all()
 
 
+def _seen(*bsdfs):
+    """The albedo of square panels, side by side in front of the camera: [panel, RGB]."""
+    T, count = mi.ScalarTransform4f, len(bsdfs)
+    shapes = [
+        {"type": "rectangle", "bsdf": bsdf,
+         "to_world": T().translate([2 * n + 1 - count, 0, 30]).rotate([0, 1, 0], 180)}
+        for n, bsdf in enumerate(bsdfs)
+    ]  # fmt: skip
+    fov = 2 * np.degrees(np.arctan(count / 30))
+    T = T().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0]).scale([-1, 1, 1])
+    film = {"type": "hdrfilm", "width": 3 * count, "height": 1, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": fov, "to_world": T, "film": film}
+    panels = {f"shape{n}": shape for n, shape in enumerate(shapes)}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, **panels})
+    found = np.stack(list(render_guides(scene, scene.sensors()[0]).values()), axis=2)
+    return found[0, 1::3, :3]
+
+
+def _metal(alpha, *rgb):
+    return {"type": "roughconductor", "material": "none", "alpha": alpha,
+            "specular_reflectance": {"type": "rgb", "value": list(rgb)}}  # fmt: skip
+
+
+def test_the_albedo_of_gloss_is_the_light_that_it_scatters():
+    metal, rgb = _metal(0.05, 0.9, 0.6, 0.3), [0.1, 0.2, 0.4]
+    coated = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": rgb}}
+    blend = {"type": "blendbsdf", "weight": 0.25, "a": metal, "b": _diffuse(*rgb)["b"]}
+    found = _seen(
+        # Mitsuba's eval_diffuse_reflectance finds 90, 60, 30 there, or 0 at an angle
+        metal, {"type": "bumpmap", "map": {"type": "uniform", "value": 0.0}, "b": metal},
+        # Radiance in glass changes by the factor 1 / 1.5 ** 2, which is no absorption
+        {"type": "roughdielectric", "alpha": 0.05},
+        coated, {"type": "mask", "opacity": 0.5, "b": metal},
+    )  # fmt: skip
+    np.testing.assert_allclose(found[:2], [[0.9, 0.6, 0.3]] * 2, rtol=0.02)
+    np.testing.assert_allclose(found[2], 1, rtol=0.02)
+    np.testing.assert_allclose(found[3], rgb, atol=1e-6)  # the gloss does not hide a texture
+    np.testing.assert_allclose(found[4], [0.45, 0.3, 0.15], rtol=0.5)  # of 32 samples
+    # At an angle, eval_diffuse_reflectance finds the diffuse part alone
+    found = _guides(_wall(9, blend, 140))[..., :3].mean((0, 1))
+    np.testing.assert_allclose(found, [0.7, 0.5, 0.325], atol=0.03)
+
+
+def test_what_is_seen_in_glass_is_not_darkened_by_it():
+    found = _guides(_wall(4, {"type": "dielectric"}), _wall(6, _diffuse(0.5, 0.5, 0.5)))
+    assert abs(found[..., :3].mean() - 0.48) < 0.01  # 4 % is reflected, into the dark
+
+
+@pytest.mark.parametrize(
+    "variant", ["llvm_ad_spectral", "llvm_ad_spectral_polarized", "llvm_ad_mono_polarized"],
+    indirect=True,
+)
+def test_the_albedo_of_metal_is_found_in_all_variants(variant):
+    (found,) = _seen(_metal(0.05, 0.5, 0.5, 0.5))
+    np.testing.assert_allclose(found, 0.5, atol=0.02)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
 def test_guides_have_colours_in_spectral_variants_too(variant):
     mirror = {"type": "conductor", "material": "none"}
