@@ -113,6 +113,14 @@ class ComposedPath(WalkIntegrator):
          samples, even from another camera. It learns again if it would take more pilot samples than
          the earlier render. An image then depends on the renders before it. The parameter is
          accepted only if a decision learns. (Default: false)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased.** Less noise, by clamping the light that a sample of a pixel may find: the direct
+         light (all that an image with :monosp:`max_depth` 2 shows, visible lights included), and
+         all other light. Where the mean over the channels of a sample's light is above the limit,
+         that light is scaled to the limit. The image then lacks light, mostly of caustics and of
+         reflected lamps, and the noise that it came with. Limits are in units of radiance: 10 times
+         the brightness of the image removes fireflies alone. 0 clamps nothing. (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -176,6 +184,8 @@ class ComposedPath(WalkIntegrator):
             mitsuba-ext compare scene.xml --time 10 path \
                 "composed_path:directions=[guided_directions:bounces=4],next_event=contribution"
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -86,6 +86,10 @@ class NEEPlusPlus(WalkIntegrator):
        - |int|
        - With :monosp:`rejection`, and only if light sampling is not learned: the number of random
          visibility tests of :monosp:`visibility_roulette`. (Default: 16)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
+         (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -123,6 +127,8 @@ class NEEPlusPlus(WalkIntegrator):
             'max_depth': 8,
             'light_sampling': 'contribution'
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -68,6 +68,10 @@ class PSSGuided(WalkIntegrator):
      * - max_memory
        - |float|
        - Memory for what is recorded and learned, in MiB. (Default: 512)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
+         (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -100,6 +104,8 @@ class PSSGuided(WalkIntegrator):
             'type': 'pss_guided',
             'max_depth': 8
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -48,6 +48,10 @@ class ReweightedDirect(WalkIntegrator):
        - Samples per pixel of a render without :monosp:`spp`; 0 for the number of the sensor's
          sampler, which is 4 by default. It has no effect if this integrator is nested in another
          one. (Default: 0)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
+         (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -76,6 +80,8 @@ class ReweightedDirect(WalkIntegrator):
             'type': 'reweighted_direct',
             'light_samples': 64
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

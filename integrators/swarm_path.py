@@ -88,6 +88,10 @@ class SwarmPath(WalkIntegrator):
          later render of the same scene, with the same parameters and film size, then takes no pilot
          samples, even from another camera. It learns again if it would take more pilot samples than
          the earlier render. An image then depends on the renders before it. (Default: false)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
+         (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -148,6 +152,8 @@ class SwarmPath(WalkIntegrator):
             'max_depth': 8,
             'lens_map': False
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

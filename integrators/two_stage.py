@@ -59,6 +59,10 @@ class TwoStage(WalkIntegrator):
      * - keep_learned
        - |bool|
        - With visibility maps: as in :class:`composed_path`. (Default: false)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
+         (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -91,6 +95,8 @@ class TwoStage(WalkIntegrator):
             'type': 'two_stage',
             'light_samples': 32
     """
+
+    can_clamp = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -22,7 +22,8 @@ from ..planning.planner import Estimators, LearningPlan, Planner, Saver
 from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
 from ..rendering.request import Request
-from ..rendering.stages import Schedule, Stage
+from ..rendering.stages import ReportedSchedule, Schedule, Stage
+from ..rendering.statistics import RenderStatistics
 from ..scene.aovs import check_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
@@ -38,6 +39,9 @@ from ..util.errors import InputError
 from ..util.stored_arrays import StoredArrays
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
+
+#: The parameters that clamp the light of a sample.
+_CLAMPS = ("clamp_direct", "clamp_indirect")
 
 #: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
 _LEAST_SPP = 4
@@ -69,19 +73,23 @@ class WalkIntegrator(StagedIntegrator):
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
          :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+     * - clamp_direct, clamp_indirect
+       - |float|
+       - **Biased**; only with :attr:`can_clamp`, see :class:`composed_path`. (Default: 0)
 
     Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
     ``keep_learned``; see :class:`composed_path`.
 
     Attributes:
         has_light_paths (bool): Whether it traces light paths besides camera paths.
+        can_clamp (bool): Whether it has the parameters ``clamp_direct`` and ``clamp_indirect``.
         sees_media (bool): Whether it renders participating media. If not, it refuses them.
         light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
     """
 
-    has_light_paths = light_paths_see_media = False
+    has_light_paths = light_paths_see_media = can_clamp = False
     sees_media = True
 
     def __init__(self, props: mi.Properties) -> None:
@@ -90,6 +98,7 @@ class WalkIntegrator(StagedIntegrator):
         max_depth = read("max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
         self.max_depth = max_depth if max_depth >= 0 else NO_LIMIT
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
+        self.clamps = self._read_clamps(props, read)
         self.aovs = read("aovs", "")
         self._aovs = self._aov_integrator(self.aovs)
         self.slots: dict[str, Technique] = {}
@@ -206,8 +215,9 @@ class WalkIntegrator(StagedIntegrator):
         doubles = any(t.doubles and t.can_learn(request.scene, 1) for t in self.slots.values())
         weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
-            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene)
-        )
+            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene),
+            **self.clamps,
+        )  # fmt: skip
         return Stage(walk, weight=weight)
 
     @property
@@ -227,9 +237,19 @@ class WalkIntegrator(StagedIntegrator):
     def schedule(
         self, request: Request, samples: tuple[int, ...], learning: LearningPlan
     ) -> Schedule:
-        return self.planner(
+        planner = self.planner(
             request, samples, learning, self.estimators(request, sum(samples), learning)
         )
+        return ReportedSchedule(planner, self._report_clamps) if self.bias else planner
+
+    @property
+    def bias(self) -> str:
+        """How the image is biased by parameters that trade bias for noise; empty if it is not."""
+        limits = [f"{key} = {limit:g}" for key, limit in self.clamps.items() if limit > 0]
+        return f"light is clamped ({', '.join(limits)})" if limits else ""
+
+    def _report_clamps(self, statistics: RenderStatistics) -> None:
+        statistics.add_learned(f"{self.bias}; the image is biased")
 
     def planner(
         self, request: Request, samples: tuple[int, ...], learning: LearningPlan,
@@ -292,8 +312,9 @@ class WalkIntegrator(StagedIntegrator):
         """A walk with this integrator's parameters and these decisions."""
         observed = {} if observer is None else {"observer": observer}
         return Walk(
-            self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed
-        )
+            self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed,
+            **self.clamps,
+        )  # fmt: skip
 
     # ---- What Mitsuba calls ----
 
@@ -335,11 +356,22 @@ class WalkIntegrator(StagedIntegrator):
             "max_depth": -1 if self.max_depth == NO_LIMIT else self.max_depth,
             "rr_depth": self.rr_depth,
             "hide_emitters": self.hide_emitters,
+            **{key: limit for key, limit in self.clamps.items() if limit > 0},
             **super().common_parameters(),
             "aovs": self.aovs or "none",
         }
 
     # ---- Helpers ----
+
+    def _read_clamps(self, props: mi.Properties, read: ParameterReader) -> dict[str, float]:
+        if self.can_clamp:
+            return {key: read(key, 0.0, minimum=0) for key in _CLAMPS}
+        for key in filter(props.has_property, _CLAMPS):
+            raise ValueError(
+                f'"{self.name}" has no parameter "{key}": only "composed_path", "auto_path" and '
+                f"others that trace nothing but camera paths clamp light"
+            )
+        return {}
 
     def _described_slots(self) -> dict[str, str]:
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}

@@ -1,4 +1,4 @@
-"""Warnings about parts of a scene that an integrator ignores."""
+"""Warnings about parts of a scene that an integrator ignores, and about biased images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ _SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpa
 
 
 def scene_remarks(loaded: LoadedScene, integrator: mi.Integrator, name: str) -> list[str]:
-    """Warns about media that ``integrator`` does not render, and about a scene without lights.
+    """Warns about media that ``integrator`` does not render, about a scene without lights, and
+    about parameters that bias the image.
 
     Parameters:
         loaded: The scene.
@@ -51,4 +52,6 @@ def scene_remarks(loaded: LoadedScene, integrator: mi.Integrator, name: str) -> 
         )
     if tracers and not loaded.scene.emitters():
         remarks.append("the scene has no light: the image is black")
+    biases = [bias for each in with_nested(integrator) if (bias := getattr(each, "bias", ""))]
+    remarks += [f'"{name}": {bias}: the image is biased' for bias in biases]
     return remarks

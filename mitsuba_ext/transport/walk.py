@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..startup.garbage import garbage_left_alone
+from ..util.arrays import channel_mean
 from .connection import Connection, Connector, can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .free_flight import Distances
@@ -63,6 +64,9 @@ class Walk:
         observer: Receives the events of the walk.
         replay: Propagates derivatives along the paths; ``None`` if they are traced for the first
             time.
+        clamp_direct, clamp_indirect: The largest mean over the channels of the light that a path
+            of one or two segments, or all longer ones together, may add to a sample: brighter
+            light is scaled to it. 0 for any. (Observers learn of light as it was before.)
     """
 
     max_depth: int
@@ -80,6 +84,8 @@ class Walk:
     program: PathProgram = field(default_factory=PathProgram)
     observer: Observer = field(default_factory=Observer)
     replay: Replay | None = None
+    clamp_direct: float = 0.0
+    clamp_indirect: float = 0.0
 
     #: See :class:`~mitsuba_ext.transport.estimator.Estimator`.
     can_be_frozen = True
@@ -115,6 +121,7 @@ class Walk:
         pixel = rays.pixel
         ray = mi.Ray3f(rays.ray)
         L = mi.Spectrum(0)                              # Radiance accumulator
+        direct = mi.Spectrum(0) if self.clamps else None  # The part of it that is direct light
         path = PathState(                               # Throughput, and how the path got here
             β=mi.Spectrum(1),
             η=mi.Float(1),
@@ -156,6 +163,7 @@ class Walk:
                 )
                 emitted = media.visible_emission(emitted, path, si, valid)
                 L = dr.fma(path.β, emitted, L)
+                direct = self._direct(direct, L, path.depth <= 1)
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
@@ -224,6 +232,8 @@ class Walk:
             if dr.hint(self.replay is not None, mode="scalar"):
                 self.replay.scattered(vertex, bs.wo, L, turns)
 
+            direct = self._direct(direct, L, path.depth == 0)
+
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
             ray = self.query.starts.along(si, si.to_world(bs.wo))
@@ -270,7 +280,22 @@ class Walk:
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
-        return Sample(L, valid, scatter_count, shadow_count, connection_count)
+        return Sample(self._clamped(L, direct), valid, scatter_count, shadow_count, connection_count)
+
+    @property
+    def clamps(self) -> bool:
+        """Whether light is clamped, so that the image is biased."""
+        return self.clamp_direct > 0 or self.clamp_indirect > 0
+
+    def _direct(self, direct, L: mi.Spectrum, is_direct: mi.Bool):
+        """The direct light of a path that has gathered ``L`` so far; all of it ``is_direct``, or
+        what was known before."""
+        return dr.select(is_direct, L, direct) if self.clamps else None
+
+    def _clamped(self, L: mi.Spectrum, direct) -> mi.Spectrum:
+        if not self.clamps:
+            return L
+        return _at_most(direct, self.clamp_direct) + _at_most(L - direct, self.clamp_indirect)
 
     def _visit(self, connects: bool, state, scene, si, active):
         """What the next event decision knows about a vertex."""
@@ -290,3 +315,12 @@ class Walk:
         if not is_made:
             sampler.next_2d()  # Keeps the later numbers the same as in `path`
         return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), None)
+
+
+def _at_most(L: mi.Spectrum, limit: float) -> mi.Spectrum:
+    """``L``, darkened so that the mean of its channels is not above the ``limit``; 0 for none."""
+    if limit == 0:
+        return L
+    limit = dr.opaque(mi.Float, limit)
+    mean = channel_mean(dr.abs(mi.unpolarized_spectrum(L)))
+    return dr.select(mean > limit, L * (limit / dr.maximum(mean, limit)), L)
