@@ -1,6 +1,7 @@
-"""What the albedo that guides a denoiser is worth: the errors of denoised images of ``path``.
+"""What the albedo that guides a denoiser is worth: the errors of denoised images.
 
     python benchmarks/denoiser_guides.py mirrors_and_glass /work/shared/scenes/kitchen/scene.xml
+    python benchmarks/denoiser_guides.py rooms --integrator composed_path:clamp_indirect=10
 
 The table has FLIP, and relMSE in brackets, the means over seeds: of the image, and of the image
 denoised by Open Image Denoise with no guides, with Mitsuba's ``eval_diffuse_reflectance`` (clipped)
@@ -23,6 +24,7 @@ from mitsuba_ext.compare.references import Reference, load_reference, render_ref
 from mitsuba_ext.images.denoising import denoise
 from mitsuba_ext.images.metrics import errors
 from mitsuba_ext.inputs.scenes import load_scene
+from mitsuba_ext.inputs.specifications import make_named
 from mitsuba_ext.rendering import guides
 from mitsuba_ext.rendering.scene_guides import render_guides
 
@@ -64,8 +66,11 @@ def images(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
 @click.argument("scenes", nargs=-1, required=True)
 @click.option("--spp", default="16,64", show_default=True)
 @click.option("--seeds", default=3, show_default=True)
+@click.option("--integrator", "specification", default="path", show_default=True)
 @click.option("--picture", metavar="FILE")
-def main(scenes: tuple[str, ...], spp: str, seeds: int, picture: str | None) -> None:
+def main(
+    scenes: tuple[str, ...], spp: str, seeds: int, specification: str, picture: str | None
+) -> None:
     """Compares on SCENES."""
     mi.set_variant("llvm_ad_rgb")
     columns = ("image", "no guides", "Mitsuba's albedo", "albedo")
@@ -76,7 +81,7 @@ def main(scenes: tuple[str, ...], spp: str, seeds: int, picture: str | None) -> 
         with mock.patch.object(guides, "_albedo", mitsubas_albedo):
             before = images(scene)
         ways = ((), before, images(scene))
-        integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+        integrator = make_named(specification, {"max_depth": max_depth}).integrator
         for count in map(int, spp.split(",")):
             found: list[list] = [[] for _ in columns]
             for seed in range(seeds):

@@ -366,7 +366,7 @@ class WalkIntegrator(StagedIntegrator):
     def _read_clamps(self, props: mi.Properties, read: ParameterReader) -> dict[str, float]:
         if self.can_clamp:
             return {key: read(key, 0.0, minimum=0) for key in _CLAMPS}
-        for key in filter(props.has_property, _CLAMPS):
+        for key in (key for key in _CLAMPS if key in props):
             raise ValueError(
                 f'"{self.name}" has no parameter "{key}": only "composed_path", "auto_path" and '
                 f"others that trace nothing but camera paths clamp light"

@@ -280,7 +280,8 @@ class Walk:
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
-        return Sample(self._clamped(L, direct), valid, scatter_count, shadow_count, connection_count)
+        L = self._clamped(L, direct)
+        return Sample(L, valid, scatter_count, shadow_count, connection_count)
 
     @property
     def clamps(self) -> bool:

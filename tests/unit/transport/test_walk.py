@@ -246,7 +246,7 @@ point = {"type": "point", "position": [0, 0, 3]}
 area = {"type": "rectangle", "emitter": {"type": "area"}}
 always = {"type": "composed_path"}
 print(size(always), size(always, point), size(always, area), size(always, area, area),
-      size(always, area, {"type": "constant"}))
+      size(always, area, {"type": "constant"}), size({**always, "clamp_direct": 1.0}, area))
 """
 
 
@@ -255,10 +255,11 @@ def test_kernels_contain_no_features_that_the_scene_lacks():
     output = subprocess.run(
         [sys.executable, "-c", KERNEL_SIZE], capture_output=True, text=True, check=True
     ).stdout
-    none, point, area, two_areas, environment = map(int, output.split()[-5:])
+    none, point, area, two_areas, environment, clamped = map(int, output.split()[-6:])
     assert none < point < area, "no lights; lights that cannot be hit; lights that can"
     assert area < two_areas, "the choice between lights"
     assert area < environment, "the environment"
+    assert area < clamped, "the limits of a sample's light"
 
 
 def test_no_scene_is_freed_while_calls_are_traced(box):
