@@ -5,7 +5,8 @@
 
 The table has FLIP, and relMSE in brackets, the means over seeds: of the image, and of the image
 denoised by Open Image Denoise with no guides, with Mitsuba's ``eval_diffuse_reflectance`` (clipped)
-as the albedo, and with the albedo of ``render_guides``. Scenes of the papers have their references
+as the albedo, and with the albedo of ``render_guides``. The last column is the mean of the image,
+divided by the mean of the reference. Scenes of the papers have their references
 beside them (``max_depth`` 6); those of our scenes are rendered by ``auto`` first and kept in
 ``out/denoiser_guides``. ``--picture`` writes the two albedos of the last scene, side by side.
 """
@@ -74,7 +75,7 @@ def main(
     """Compares on SCENES."""
     mi.set_variant("llvm_ad_rgb")
     columns = ("image", "no guides", "Mitsuba's albedo", "albedo")
-    print(f"| scene | spp | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}", flush=True)
+    print(f"| scene | spp | {' | '.join(columns)} | mean |\n|---|---|---|{'---|' * len(columns)}")
     for name in scenes:
         reference, size, max_depth = reference_of(name)
         scene = load(name, size)
@@ -84,9 +85,11 @@ def main(
         integrator = make_named(specification, {"max_depth": max_depth}).integrator
         for count in map(int, spp.split(",")):
             found: list[list] = [[] for _ in columns]
+            means = []
             for seed in range(seeds):
                 image = mi.render(scene, integrator=integrator, seed=100 + seed, spp=count)
                 image = np.array(image)[..., :3]
+                means.append(image.mean() / reference.mean.mean())
                 made = (image, *(denoise(image, *way) for way in ways))
                 for column, result in zip(found, made):
                     column.append(errors(result, reference.mean, reference.variance))
@@ -94,7 +97,8 @@ def main(
                 f"{np.mean([e.flip for e in es]):.4f} ({np.mean([e.relmse for e in es]):.2g})"
                 for es in found
             )
-            print(f"| {title(name)} | {count} | {' | '.join(cells)} |", flush=True)
+            row = [title(name), str(count), *cells, f"{np.mean(means):.3f}"]
+            print(f"| {' | '.join(row)} |", flush=True)
     if picture:
         both = np.concatenate([before[0], np.ones_like(before[0][:, :8]), ways[2][0]], axis=1)
         mi.util.write_bitmap(picture, mi.TensorXf(both), write_async=False)
