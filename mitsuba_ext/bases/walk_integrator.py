@@ -73,9 +73,6 @@ class WalkIntegrator(StagedIntegrator):
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
          :monosp:`depth:depth,nn:sh_normal`. (Default: none)
-     * - clamp_direct, clamp_indirect
-       - |float|
-       - **Biased**; only with :attr:`can_clamp`, see :class:`composed_path`. (Default: 0)
 
     Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
     ``keep_learned``; see :class:`composed_path`.

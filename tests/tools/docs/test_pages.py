@@ -55,6 +55,7 @@ VALUES = {
     "choice": "clustered", "bound": 2.0, "compensation": False,
     **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
     **dict.fromkeys(["final_gather", "guided", "photon_aovs", "light_aovs"], True),
+    **dict.fromkeys(["clamp_direct", "clamp_indirect"], 2.0),
     "accuracy": 0.25, "max_share": 0.5, "effort": 2.0, "gather_samples": 64,
     "cache_file": "cache.npz", "min_spacing": 3.0, "max_spacing": 8.0,
     "checkpoint": "kept", "checkpoint_every": "9s",
