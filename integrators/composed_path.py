@@ -118,9 +118,10 @@ class ComposedPath(WalkIntegrator):
        - **Biased.** Less noise, by clamping the light that a sample of a pixel may find: the direct
          light (all that an image with :monosp:`max_depth` 2 shows, visible lights included), and
          all other light. Where the mean over the channels of a sample's light is above the limit,
-         that light is scaled to the limit. The image then lacks light, mostly of caustics and of
-         reflected lamps, and the noise that it came with. Limits are in units of radiance: 10 times
-         the brightness of the image removes fireflies alone. 0 clamps nothing. (Default: 0)
+         that light is scaled to the limit. (Cycles, which has the same parameters, scales each
+         contribution to a sample by itself.) The image then lacks light, mostly of caustics and of
+         reflected lamps, and the noise that it came with. Limits are in units of radiance: begin
+         with 10 times the brightness of the image. 0 clamps nothing. (Default: 0)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,

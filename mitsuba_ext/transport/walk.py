@@ -163,7 +163,8 @@ class Walk:
                 )
                 emitted = media.visible_emission(emitted, path, si, valid)
                 L = dr.fma(path.β, emitted, L)
-                direct = self._direct(direct, L, path.depth <= 1)
+                if dr.hint(self.clamps, mode="scalar"):
+                    direct += dr.select(path.depth <= 1, path.β * emitted, 0)
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
@@ -232,7 +233,8 @@ class Walk:
             if dr.hint(self.replay is not None, mode="scalar"):
                 self.replay.scattered(vertex, bs.wo, L, turns)
 
-            direct = self._direct(direct, L, path.depth == 0)
+            if dr.hint(self.clamps, mode="scalar"):
+                direct = dr.select(path.depth == 0, L, direct)
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
@@ -288,11 +290,6 @@ class Walk:
         """Whether light is clamped, so that the image is biased."""
         return self.clamp_direct > 0 or self.clamp_indirect > 0
 
-    def _direct(self, direct, L: mi.Spectrum, is_direct: mi.Bool):
-        """The direct light of a path that has gathered ``L`` so far; all of it ``is_direct``, or
-        what was known before."""
-        return dr.select(is_direct, L, direct) if self.clamps else None
-
     def _clamped(self, L: mi.Spectrum, direct) -> mi.Spectrum:
         if not self.clamps:
             return L
@@ -323,5 +320,5 @@ def _at_most(L: mi.Spectrum, limit: float) -> mi.Spectrum:
     if limit == 0:
         return L
     limit = dr.opaque(mi.Float, limit)
-    mean = channel_mean(dr.abs(mi.unpolarized_spectrum(L)))
+    mean = channel_mean(L)
     return dr.select(mean > limit, L * (limit / dr.maximum(mean, limit)), L)
