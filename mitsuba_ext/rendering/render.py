@@ -51,9 +51,14 @@ def render(integrator: Staged, request: Request, job: type[Job] | None = None) -
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
     scene, sensor = request.scene, request.sensor
+    if request.job is not None and job is not None:
+        raise NotImplementedError(
+            f'"{integrator.name}" distributes its samples itself: replay the integrator that is '
+            f"nested in it"
+        )
 
     def attempt() -> tuple[Job, threading.Event]:
-        made = (job or Job)(integrator, request)
+        made = (request.job or job or Job)(integrator, request)
         try:
             with deferred_interrupt() as interrupt:
                 made.run(interrupt)

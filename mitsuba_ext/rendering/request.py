@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 
@@ -24,6 +25,8 @@ class Request:
         samples_before: Samples per pixel of the batches with smaller numbers.
         save_learned, load_learned: Files in the place of the parameters of these names; empty for
             the parameters.
+        job: Makes what takes the samples (:class:`mitsuba_ext.rendering.render.Job`) from the
+            integrator and the request; ``None`` for the integrator's own choice.
     """
 
     scene: mi.Scene
@@ -38,6 +41,7 @@ class Request:
     samples_before: int = 0
     save_learned: str = ""
     load_learned: str = ""
+    job: Callable[..., Any] | None = None
 
     @property
     def is_timed(self) -> bool:

@@ -68,6 +68,15 @@ def pass_length(sensor: mi.Sensor, is_timed: bool = False) -> int:
     return sample_count(sensor, 1 << (limit.bit_length() - 1))
 
 
+def pass_seed(seed: int, index: int) -> int:
+    """The seed of pass ``index`` of a render with this seed."""
+    if index == 0:
+        return seed
+    # A hash, and different from the seeds of batches (see batch_seeds)
+    stream = mi.UInt32(index + _STREAM)
+    return mi.sample_tea_32(mi.UInt32(seed), stream)[1][0]
+
+
 class SeedPasses:
     """A render with an integrator for which :func:`can_render` is true.
 
@@ -141,7 +150,7 @@ class SeedPasses:
         """Adds a pass; returns its seconds, and whether it compiled a kernel."""
         spp = sample_count(self._sensor, spp)
         timer = PassTimer()
-        seed = self._seed if self.passes == 0 else self._scattered_seed()
+        seed = pass_seed(self._seed, self.passes)
         # render() develops the film, because "prb" refuses develop=False
         with garbage_left_alone():
             self._integrator.render(self._scene, self._sensor, seed, spp)
@@ -149,8 +158,3 @@ class SeedPasses:
         elapsed, is_new = timer.seconds, timer.has_new_kernels
         self.passes += 1
         return elapsed, is_new
-
-    def _scattered_seed(self) -> int:
-        # A hash, and different from the seeds of batches (see batch_seeds)
-        stream = mi.UInt32(self.passes + _STREAM)
-        return mi.sample_tea_32(mi.UInt32(self._seed), stream)[1][0]

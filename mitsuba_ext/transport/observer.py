@@ -93,6 +93,10 @@ class Observer:
         """The primary sample ``sample``, of density 1 / ``weight``, chose the direction in which a
         path continues. The path has gathered the radiance ``L`` so far."""
 
+    def scattering(self, vertex: Vertex, bs: mi.BSDFSample3f, active: mi.Bool) -> None:
+        """Paths have gained all light at ``vertex``. ``bs`` is the direction in which they leave it
+        (from the BSDF or the phase function), unless it is their last vertex."""
+
     def survival(self, path: PathState, probability: mi.Float, active: mi.Bool) -> None:
         """Russian roulette lets a path continue with this probability; ``path`` is its state for
         the next vertex, whose throughput is not yet divided by the probability."""
@@ -141,6 +145,10 @@ class Observers(Observer):
     def direction(self, *arguments: Any) -> None:
         for observer in self._observers:
             observer.direction(*arguments)
+
+    def scattering(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.scattering(*arguments)
 
     def survival(self, *arguments: Any) -> None:
         for observer in self._observers:

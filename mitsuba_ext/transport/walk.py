@@ -230,6 +230,7 @@ class Walk:
                 shadow_count += dr.select(tested, 1, 0)
             bs, bsdf_weight = media.scatter(vertex, sample_1, sample_2, bs, bsdf_weight)
             self.observer.direction(vertex, sample_2, directions_weight, L, turns)
+            self.observer.scattering(vertex, bs, active)
             if dr.hint(self.replay is not None, mode="scalar"):
                 self.replay.scattered(vertex, bs.wo, L, turns)
 

@@ -1,0 +1,126 @@
+"""Makes paths from the rows of a log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .path_log import CONNECTION, EMISSION, IN_MEDIUM, JOINED, MERGED, SURVIVAL, VERTEX, Row, Rows
+from .paths import FoundLight, Numbers, PathVertex
+
+_TECHNIQUES = ("emission", "connection", "light path", "merge")
+
+#: The words for each lobe of a BSDF.
+_LOBES = {
+    "Null": "straight through", "DiffuseReflection": "diffuse reflection",
+    "DiffuseTransmission": "diffuse transmission", "GlossyReflection": "glossy reflection",
+    "GlossyTransmission": "glossy transmission", "DeltaReflection": "delta reflection",
+    "DeltaTransmission": "delta transmission",
+}  # fmt: skip
+
+
+class PathReader:
+    """Makes paths from the rows of a log, and finds the names of what they meet.
+
+    Parameters:
+        scene: The scene, whose ids become names.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self._names: dict[tuple[str, int], str] = {}
+        self._lights = {id(s.emitter()): _name(s) for s in scene.shapes() if s.emitter()}
+
+    def path(self, rows: Rows) -> tuple[tuple[PathVertex, ...], tuple[FoundLight, ...]]:
+        """The vertices of the path whose rows these are, and the light that belongs to none."""
+        # Several vertices have the same depth where all except the last are index-matched
+        vertices: list[dict[str, Any]] = []
+        last_of: dict[int, dict[str, Any]] = {}
+        for row in rows.of_kind(VERTEX):
+            vertices.append({**self._vertex(row), "lights": []})
+            last_of[int(row["depth"])] = vertices[-1]
+        for row in rows.of_kind(SURVIVAL):
+            if (before := last_of.get(int(row["depth"]) - 1)) is not None:
+                before["survival"] = float(row["weight"][0])
+        loose, environment = [], None
+        for kind in (EMISSION, CONNECTION, JOINED, MERGED):
+            for row in rows.of_kind(kind):
+                light, vertex = self._light(kind, row), last_of.get(int(row["depth"]))
+                if kind == EMISSION and self._is_environment(row):
+                    if environment is None:
+                        environment = {**self._environment(row), "lights": []}
+                    vertex = environment
+                (loose if vertex is None else vertex["lights"]).append(light)
+        vertices += [environment] if environment else []
+        if vertices:
+            vertices[-1] |= {"event": "end", "pdf": None, "survival": 1.0}
+        made = (PathVertex(**{**each, "lights": tuple(each["lights"])}) for each in vertices)
+        return tuple(made), tuple(loose)
+
+    def _vertex(self, row: Row) -> dict[str, Any]:
+        flags, is_medium = int(row["flags"]), bool(row["flags"] & np.uint32(IN_MEDIUM))
+        names = [text for name, text in _LOBES.items() if _has(flags, name)]
+        return {
+            "kind": "medium" if is_medium else "surface",
+            "position": _numbers(row["p"]),
+            "normal": None if is_medium else _numbers(row["n"]),
+            "shape": "" if is_medium else self._named(mi.ShapePtr, row["object"]),
+            "bsdf": "" if is_medium else self._named(mi.BSDFPtr, row["bsdf"]),
+            "event": "scattering" if is_medium else " or ".join(names) or "absorption",
+            "throughput": self._throughput(row),
+            "pdf": float(row["pdf"][0]),
+        }
+
+    def _environment(self, row: Row) -> dict[str, Any]:
+        return {
+            "kind": "environment", "position": _numbers(row["n"]), "normal": None, "shape": "",
+            "bsdf": "", "event": "end", "throughput": self._throughput(row), "pdf": None,
+        }  # fmt: skip
+
+    def _light(self, kind: int, row: Row) -> FoundLight:
+        rgb, mis = _numbers(row["rgb"]), float(row["weight"][0])
+        if kind not in (EMISSION, CONNECTION):
+            count = int(row["flags"]) if kind == JOINED else None
+            return FoundLight(_TECHNIQUES[kind], rgb, mis=mis, light_vertices=count)
+        return FoundLight(
+            _TECHNIQUES[kind], rgb, self._named(mi.EmitterPtr, row["object"]),
+            _numbers(row["n" if self._is_environment(row) else "p"]), float(row["pdf"][0]),
+            float(row["other_pdf"][0]), mis,
+        )  # fmt: skip
+
+    def _is_environment(self, row: Row) -> bool:
+        emitter = _object(mi.EmitterPtr, row["object"])
+        return emitter is not None and emitter.is_environment()
+
+    def _throughput(self, row: Row) -> Numbers:
+        return _numbers(row["throughput"][: len(mi.Spectrum())])
+
+    def _named(self, kind: type, number: np.uint32) -> str:
+        key = (kind.__name__, int(number))
+        if key not in self._names:
+            found = _object(kind, number)
+            name = "" if found is None else self._lights.get(id(found)) or _name(found)
+            self._names[key] = name
+        return self._names[key]
+
+
+def _has(flags: int, name: str) -> bool:
+    return bool(flags & int(getattr(mi.BSDFFlags, name)))
+
+
+def _object(kind: type, number: np.uint32) -> Any:
+    """The object of a number of Dr.Jit's registry; ``None`` for 0."""
+    return dr.reinterpret_array(kind, mi.UInt32(int(number)))[0]
+
+
+def _name(found: Any) -> str:
+    """The name of an object: its id, if the scene gives it one, and its class."""
+    name = found.id()
+    kind = getattr(found, "name", None) or found.class_name() or type(found).__name__
+    return f"{name} ({kind})" if name and not name.startswith("_unnamed") else kind
+
+
+def _numbers(values: Any) -> Numbers:
+    return tuple(float(value) for value in values)
