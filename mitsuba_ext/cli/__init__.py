@@ -27,6 +27,7 @@ from .export_blender import export_blender
 from .merge import merge
 from .plugins import list_plugins
 from .render import render
+from .replay import replay
 from .supervisor import SUPERVISED
 
 
@@ -50,7 +51,7 @@ def doctor() -> int:
 
 
 for command in (
-    render, merge, denoise, compare, diff, list_plugins, doctor, export_blender, completion,
+    render, merge, denoise, compare, diff, replay, list_plugins, doctor, export_blender, completion,
 ):  # fmt: skip
     cli.add_command(command)
 

@@ -48,6 +48,16 @@ class CropType(click.ParamType):
         return tuple(map(int, match.groups()))
 
 
+class PixelType(click.ParamType):
+    name = "pixel"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        match = re.fullmatch(r"(\d+),(\d+)", value)
+        if not match:
+            self.fail(f'expected a column and a row like 120,45, found "{value}"', param, ctx)
+        return int(match.group(1)), int(match.group(2))
+
+
 class NumberList(click.ParamType):
     name = "numbers"
 

@@ -7,13 +7,16 @@ Python::
 
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file("scene.xml")
-    pixels, image = replay.bright_pixels(scene, 3, spp=64)
-    for pixel in replay.paths_of_pixels(scene, pixels, spp=64):
-        print(pixel.pixel, pixel.value, pixel.paths[0].vertices)
+    integrator = mi.load_dict({"type": "auto"})
+    pixels, image = replay.bright_pixels(scene, 3, integrator, spp=64)
+    found = replay.paths_of_pixels(scene, pixels, integrator, spp=64)
+    print(found[0].paths[0].vertices)
+    replay.draw_paths("paths.png", image, scene, scene.sensors()[0], found)
 """
 
 from __future__ import annotations
 
+from .drawing import draw_paths
 from .paths import FoundLight, PathVertex, PixelPaths, SamplePath
 from .render_again import bright_pixels, paths_of_pixels
 
@@ -23,5 +26,6 @@ __all__ = [
     "PixelPaths",
     "SamplePath",
     "bright_pixels",
+    "draw_paths",
     "paths_of_pixels",
 ]

@@ -1,4 +1,4 @@
-"""The passes in which ``mitsuba-ext render`` renders with Mitsuba's own integrators."""
+"""The passes in which Mitsuba's own integrators render."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ class _Plan(RenderPlan):
         return min(self.limit, samples)
 
 
-class InMitsubasPasses:
-    """Mixed into a :class:`Job`: its passes have the lengths and the seeds of
-    :class:`~mitsuba_ext.rendering.seed_passes.SeedPasses`. A single pass is what ``mi.render``
-    renders."""
+class _OfMitsuba:
+    """Mixed into a :class:`Job`, to take the samples of one of Mitsuba's integrators."""
+
+    #: Whether all samples are taken in one pass.
+    is_one_pass = False
 
     def __init__(self, integrator, request, *arguments) -> None:
         super().__init__(integrator, request, *arguments)
-        limit, plan = pass_length(self.sensor), self.plan
+        plan = self.plan
+        limit = plan.spp if self.is_one_pass else pass_length(self.sensor)
         if plan.structured and plan.spp > min(limit, plan.limit):
             raise NotImplementedError(
                 f"{plan.spp} samples per pixel of Mitsuba's own integrators with a structured "
@@ -41,3 +43,14 @@ class InMitsubasPasses:
         seed = pass_seed(self.request.seed, self.statistics.passes)
         camera.tell_film(sampler, self.film, getattr(pixels, "start", 0))
         sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
+
+
+class InPasses(_OfMitsuba):
+    """Passes of the lengths and the seeds of
+    :class:`~mitsuba_ext.rendering.seed_passes.SeedPasses`."""
+
+
+class InOnePass(_OfMitsuba):
+    """One pass, as in ``mi.render``."""
+
+    is_one_pass = True

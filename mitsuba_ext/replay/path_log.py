@@ -15,7 +15,7 @@ from ..util.arrays import channel_mean
 from ..util.spectra import to_rgb
 
 #: The kinds of rows.
-KINDS = EMISSION, CONNECTION, JOINED, MERGED, VERTEX, SURVIVAL = range(6)
+KINDS = EMISSION, JOINED, MERGED, VERTEX, SURVIVAL, *CONNECTIONS = range(9)
 
 #: The columns of a row: whole numbers, and floats with their number of components.
 _WHOLE = ("lane", "depth", "object", "bsdf", "flags")
@@ -65,7 +65,9 @@ class PathLog(Observer):
     connections and merges: it has the methods of their observers.
 
     Each event appends a row to a table, at a place that an atomic counter gives. Each kind of event
-    has a table and a counter: Dr.Jit allows one increment of a counter in a loop.
+    has a table and a counter: Dr.Jit allows one increment of a counter in a loop. Connections have
+    several, because the walk may connect a vertex at two places of its loop, which it may trace
+    twice.
 
     Parameters:
         capacity: The largest number of rows of a kind in a pass.
@@ -129,7 +131,7 @@ class PathLog(Observer):
         )  # fmt: skip
 
     def vertex(self, vertex, active) -> None:
-        self._depth = vertex.depth
+        self._depth, self._connections = vertex.depth, iter(CONNECTIONS)
 
     def connection(
         self, choice, vertex, ds, contribution, value, pdf, visible, tested
@@ -137,7 +139,7 @@ class PathLog(Observer):
         whole = channel_mean(vertex.path.β * contribution)
         weight = dr.select(whole != 0, channel_mean(value) / whole, 0)
         self._add(
-            CONNECTION, vertex.depth, visible & _is_light(value), object=_number(ds.emitter),
+            next(self._connections), vertex.depth, visible & _is_light(value), object=_number(ds.emitter),
             p=ds.p, n=ds.d, rgb=self._rgb(value), throughput=vertex.path.β, pdf=ds.pdf,
             other_pdf=pdf, weight=weight,
         )  # fmt: skip

@@ -22,8 +22,9 @@ class FoundLight:
             the sensor), or ``other`` (what the integrator adds without saying where, such as
             interpolated irradiance).
         light: The light; empty if it is unknown.
-        position: The point on the light; of an environment, the direction towards it. ``None`` if
-            it is unknown.
+        position: The point on the light, or the direction towards it if it is infinitely far away.
+            ``None`` if it is unknown.
+        is_infinite: Whether the light is infinitely far away.
         pdf: The density, in solid angle at the previous vertex (``emission``) or at this one
             (``connection``), with which this technique finds the light. ``None`` if it is unknown.
         other_pdf: The density with which the other of these two techniques finds it.
@@ -37,6 +38,7 @@ class FoundLight:
     radiance: Numbers
     light: str = ""
     position: Numbers | None = None
+    is_infinite: bool = False
     pdf: float | None = None
     other_pdf: float | None = None
     mis: float | None = None

@@ -8,10 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .path_log import CONNECTION, EMISSION, IN_MEDIUM, JOINED, MERGED, SURVIVAL, VERTEX, Row, Rows
+from .path_log import CONNECTIONS, EMISSION, IN_MEDIUM, JOINED, MERGED, SURVIVAL, VERTEX, Row, Rows
 from .paths import FoundLight, Numbers, PathVertex
 
-_TECHNIQUES = ("emission", "connection", "light path", "merge")
+_TECHNIQUES = {
+    EMISSION: "emission", JOINED: "light path", MERGED: "merge",
+    **dict.fromkeys(CONNECTIONS, "connection"),
+}  # fmt: skip
 
 #: The words for each lobe of a BSDF.
 _LOBES = {
@@ -45,10 +48,10 @@ class PathReader:
             if (before := last_of.get(int(row["depth"]) - 1)) is not None:
                 before["survival"] = float(row["weight"][0])
         loose, environment = [], None
-        for kind in (EMISSION, CONNECTION, JOINED, MERGED):
+        for kind in _TECHNIQUES:
             for row in rows.of_kind(kind):
                 light, vertex = self._light(kind, row), last_of.get(int(row["depth"]))
-                if kind == EMISSION and self._is_environment(row):
+                if kind == EMISSION and self._is_infinite(row):
                     if environment is None:
                         environment = {**self._environment(row), "lights": []}
                     vertex = environment
@@ -81,18 +84,20 @@ class PathReader:
 
     def _light(self, kind: int, row: Row) -> FoundLight:
         rgb, mis = _numbers(row["rgb"]), float(row["weight"][0])
-        if kind not in (EMISSION, CONNECTION):
+        if kind in (JOINED, MERGED):
             count = int(row["flags"]) if kind == JOINED else None
             return FoundLight(_TECHNIQUES[kind], rgb, mis=mis, light_vertices=count)
+        is_infinite = self._is_infinite(row)
         return FoundLight(
             _TECHNIQUES[kind], rgb, self._named(mi.EmitterPtr, row["object"]),
-            _numbers(row["n" if self._is_environment(row) else "p"]), float(row["pdf"][0]),
+            _numbers(row["n" if is_infinite else "p"]), is_infinite, float(row["pdf"][0]),
             float(row["other_pdf"][0]), mis,
         )  # fmt: skip
 
-    def _is_environment(self, row: Row) -> bool:
+    def _is_infinite(self, row: Row) -> bool:
+        """Whether the light of this row is infinitely far away."""
         emitter = _object(mi.EmitterPtr, row["object"])
-        return emitter is not None and emitter.is_environment()
+        return emitter is not None and bool(int(emitter.flags()) & int(mi.EmitterFlags.Infinite))
 
     def _throughput(self, row: Row) -> Numbers:
         return _numbers(row["throughput"][: len(mi.Spectrum())])

@@ -9,11 +9,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..images.image_files import film_channels, to_rgb
 from ..rendering.camera import film_extent, find_sensor, first_pixel
 from ..rendering.staged import is_staged
+from ..scene.media import may_have_media
 from ..scene.nesting import with_nested
+from ..transport.heroes import disperses
 from .bright_pixels import BrightPixelsJob
-from .passes_of_mitsuba import InMitsubasPasses
+from .passes_of_mitsuba import InOnePass, InPasses
 from .paths import FoundLight, PixelPaths, SamplePath, luminance
 from .reading import PathReader
 from .replay_job import PixelRecord, Recorded, ReplayJob
@@ -40,6 +43,7 @@ def paths_of_pixels(
     seed: int = 0,
     spp: int = 0,
     top: int = 3,
+    in_passes: bool = False,
 ) -> list[PixelPaths]:
     """The brightest samples of some pixels, with all vertices of their paths. They are the samples
     that ``mi.render`` takes with the same arguments, drawn with the same random numbers. The film
@@ -50,10 +54,12 @@ def paths_of_pixels(
         pixels: Column and row of each pixel in the image (of the crop window, if there is one),
             counted from 0 in the upper left corner. At most 64.
         integrator: The integrator; the scene's own by default. Any of ours that has samples, and
-            Mitsuba's ``path`` and ``volpath``. These render in the passes of ``mitsuba-ext
-            render``; a render of one pass is the image of ``mi.render``.
+            Mitsuba's ``path`` and ``volpath`` (without media), whose samples ``composed_path``
+            takes.
         sensor, seed, spp: As for ``mi.render``.
         top: The number of samples that are returned of each pixel.
+        in_passes: Whether Mitsuba's integrators render in the passes of ``mitsuba-ext render``, and
+            not in the single one of ``mi.render``.
 
     Raises:
         ValueError: A pixel is not in the image, or an argument is out of range.
@@ -65,7 +71,7 @@ def paths_of_pixels(
     if top < 1:
         raise ValueError(f"top is {top}; it must be 1 or more")
     indices = [_index(sensor.film(), pixel) for pixel in pixels]
-    render = _Render(scene, integrator, sensor, seed, spp)
+    render = _Render(scene, integrator, sensor, seed, spp, in_passes)
     capacity = _CAPACITY
     while True:
         job = render.run(ReplayJob, indices, top, capacity)
@@ -83,18 +89,19 @@ def bright_pixels(
     sensor: int | mi.Sensor = 0,
     seed: int = 0,
     spp: int = 0,
+    in_passes: bool = False,
 ) -> tuple[list[tuple[int, int]], np.ndarray]:
     """The pixels that a single sample brightens most: by the difference between the mean of all
     samples of a pixel and the mean without the brightest one. Renders the image. The parameters,
     and what is raised, are as for :func:`paths_of_pixels`.
 
     Returns:
-        Up to ``count`` pixels, the first by this difference first, and the image.
+        Up to ``count`` pixels, the first by this difference first, and the image as linear RGB [height, width, 3].
     """
     sensor = find_sensor(scene, sensor)
-    job = _Render(scene, integrator, sensor, seed, spp).run(BrightPixelsJob)
-    image = np.array(sensor.film().develop(), dtype=np.float32)
-    return job.brightest(count), image
+    job = _Render(scene, integrator, sensor, seed, spp, in_passes).run(BrightPixelsJob)
+    film = sensor.film()
+    return job.brightest(count), to_rgb(film.develop(), film_channels(film))
 
 
 class _Render:
@@ -102,19 +109,31 @@ class _Render:
 
     def __init__(
         self, scene: mi.Scene, integrator: mi.Integrator | None, sensor: mi.Sensor, seed: int,
-        spp: int,
+        spp: int, in_passes: bool,
     ) -> None:  # fmt: skip
         chosen = scene.integrator() if integrator is None else integrator
         if chosen is None:
             raise ValueError("the scene has no integrator: give one")
         self._integrator, self._is_of_mitsuba = replayable(chosen)
+        if self._is_of_mitsuba:
+            for is_in_scene, what in (
+                (may_have_media(scene), "participating media"),
+                (mi.is_spectral and disperses(scene.shapes()), "dispersion"),
+            ):
+                if is_in_scene:
+                    raise NotImplementedError(
+                        f'"{chosen.class_name()}" cannot be replayed in a scene with {what}, where '
+                        f'"composed_path" takes other samples: render and replay "composed_path"'
+                    )
+        self._in_passes = in_passes
         self._scene, self._sensor, self._seed, self._spp = scene, sensor, seed, spp
 
     def run(self, job: type, *arguments: Any) -> Any:
         """Renders with a job of this class, whose further arguments these are, and returns it."""
         made = []
         if self._is_of_mitsuba:
-            job = type(job.__name__, (InMitsubasPasses, job), {})
+            layout = InPasses if self._in_passes else InOnePass
+            job = type(job.__name__, (layout, job), {})
 
         def make(integrator, request):
             made.append(job(integrator, request, *arguments))
