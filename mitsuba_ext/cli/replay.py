@@ -153,7 +153,7 @@ def replay(
         click.echo(json.dumps(_without_nan(record), allow_nan=False))
         return 0
     if not found:
-        say("no pixel has any light", err=False)
+        say("no pixel stands out: the samples of each pixel are equally bright", err=False)
     for pixel in found:
         _print(pixel)
     if output is not None:
@@ -223,18 +223,20 @@ def _without_nan(value: Any) -> Any:
 
 
 def _print(pixel: PixelPaths) -> None:
+    from rich import box
     from rich.table import Table
 
     console = console_for_tables()
     x, y = pixel.pixel
     console.print(
-        f"pixel {x},{y}: {_numbers(pixel.value)} from {pixel.spp} samples", style="bold",
-        highlight=False,
+        f"pixel {x},{y}: {_numbers(pixel.value)} from {pixel.spp} "
+        f"sample{'' if pixel.spp == 1 else 's'}", style="bold", highlight=False,
     )  # fmt: skip
     for path in pixel.paths:
         table = Table(
-            "", "event", "shape", "BSDF", "position", "throughput", "pdf", "light found by",
-            "light", "pdf", "MIS", "radiance", title=_title(path), title_justify="left",
+            "", "event", "shape", "BSDF", "position", "throughput", "pdf", "roulette",
+            "light found by", "light", "pdf", "MIS", "radiance", title=_title(path),
+            title_justify="left", box=box.SIMPLE_HEAD,
         )  # fmt: skip
         for row in _rows(path):
             table.add_row(*row)
@@ -252,17 +254,17 @@ def _rows(path: SamplePath) -> Iterator[list[str]]:
         first = [
             str(number), *_event(vertex), _numbers(vertex.position),
             _number(max(vertex.throughput, default=0.0)), _number(vertex.pdf),
+            "" if vertex.survival == 1 else _number(vertex.survival),
         ]  # fmt: skip
         yield from _with_lights(first, vertex.lights)
     if path.lights:
-        yield from _with_lights([""] * 7, path.lights)
+        yield from _with_lights([""] * 8, path.lights)
 
 
 def _event(vertex: PathVertex) -> list[str]:
-    roulette = "" if vertex.survival == 1 else f", survives with {_number(vertex.survival)}"
     if vertex.kind == "surface":
-        return [vertex.event + roulette, vertex.shape, vertex.bsdf]
-    return [vertex.event + roulette, vertex.kind, ""]
+        return [vertex.event, vertex.shape, vertex.bsdf]
+    return [vertex.event, vertex.kind, ""]
 
 
 def _with_lights(first: list[str], lights: Sequence[FoundLight]) -> Iterator[list[str]]:

@@ -139,9 +139,9 @@ class PathLog(Observer):
         whole = channel_mean(vertex.path.β * contribution)
         weight = dr.select(whole != 0, channel_mean(value) / whole, 0)
         self._add(
-            next(self._connections), vertex.depth, visible & _is_light(value), object=_number(ds.emitter),
-            p=ds.p, n=ds.d, rgb=self._rgb(value), throughput=vertex.path.β, pdf=ds.pdf,
-            other_pdf=pdf, weight=weight,
+            next(self._connections), vertex.depth, visible & _is_light(value),
+            object=_number(ds.emitter), p=ds.p, n=ds.d, rgb=self._rgb(value),
+            throughput=vertex.path.β, pdf=ds.pdf, other_pdf=pdf, weight=weight,
         )  # fmt: skip
 
     def scattering(self, vertex, bs, active) -> None:

@@ -121,10 +121,11 @@ def _object(kind: type, number: np.uint32) -> Any:
 
 
 def _name(found: Any) -> str:
-    """The name of an object: its id, if the scene gives it one, and its class."""
+    """The id that the scene gives an object, or else its class."""
     name = found.id()
-    kind = getattr(found, "name", None) or found.class_name() or type(found).__name__
-    return f"{name} ({kind})" if name and not name.startswith("_unnamed") else kind
+    if name and not name.startswith("_unnamed"):
+        return name
+    return getattr(found, "name", None) or found.class_name() or type(found).__name__
 
 
 def _numbers(values: Any) -> Numbers:

@@ -96,7 +96,8 @@ def bright_pixels(
     and what is raised, are as for :func:`paths_of_pixels`.
 
     Returns:
-        Up to ``count`` pixels, the first by this difference first, and the image as linear RGB [height, width, 3].
+        Up to ``count`` pixels, the pixel with the largest difference first, and the image as linear
+        RGB [height, width, 3]. Pixels whose samples are all equally bright are left out.
     """
     sensor = find_sensor(scene, sensor)
     job = _Render(scene, integrator, sensor, seed, spp, in_passes).run(BrightPixelsJob)
@@ -163,12 +164,12 @@ def replayable(integrator: mi.Integrator) -> tuple[mi.Integrator, bool]:
     name = getattr(integrator, "name", kind)
     if not is_staged(integrator):
         raise NotImplementedError(
-            f'"{name}" cannot be replayed: its samples do not follow from its image. Replay '
-            f'"path", "volpath" or an integrator of mitsuba_ext, without integrators around it'
+            f'"{name}" cannot be replayed: only "path", "volpath" and integrators of mitsuba_ext '
+            f'can, which must not be nested in another one (except in "aov")'
         )
     if reason := getattr(integrator, "missing_in_samples", ""):
         raise NotImplementedError(
-            f'"{name}" cannot be replayed: camera samples are not its whole image ({reason})'
+            f'"{name}" cannot be replayed: its image is not the mean of camera samples ({reason})'
         )
     for key, is_set in (("timeout", integrator.timeout > 0), ("checkpoint", integrator.checkpoint)):
         if is_set:
