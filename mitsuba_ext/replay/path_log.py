@@ -3,6 +3,8 @@ them."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -14,8 +16,11 @@ from ..transport.observer import Observer
 from ..util.arrays import channel_mean
 from ..util.spectra import to_rgb
 
-#: The kinds of rows.
-KINDS = EMISSION, JOINED, MERGED, VERTEX, SURVIVAL, *CONNECTIONS = range(9)
+#: The kinds of rows. Dr.Jit allows one increment of a counter in a loop. The walk may connect and
+#: merge a vertex at several places of its loop, which therefore take turns with several kinds.
+KINDS = range(16)
+EMISSION, JOINED, VERTEX, SURVIVAL = KINDS[:4]
+CONNECTIONS, MERGES = KINDS[4:8], KINDS[8:]
 
 #: The columns of a row: whole numbers, and floats with their number of components.
 _WHOLE = ("lane", "depth", "object", "bsdf", "flags")
@@ -64,22 +69,20 @@ class PathLog(Observer):
     """Observes the paths in chosen lanes of a pass. Estimators with light paths also tell it of
     connections and merges: it has the methods of their observers.
 
-    Each event appends a row to a table, at a place that an atomic counter gives. Each kind of event
-    has a table and a counter: Dr.Jit allows one increment of a counter in a loop. Connections have
-    several, because the walk may connect a vertex at two places of its loop, which it may trace
-    twice.
+    Each event appends a row to the table of its kind, at a place that an atomic counter gives.
 
     Parameters:
-        capacity: The largest number of rows of a kind in a pass.
+        capacities: The largest number of rows of each kind in a pass.
     """
 
     can_be_frozen = compares = False
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self._most = dr.opaque(mi.UInt32, capacity)
-        self._whole = dr.zeros(mi.UInt32, len(KINDS) * capacity * len(_WHOLE))
-        self._floats = dr.zeros(mi.Float, len(KINDS) * capacity * _FLOAT_COUNT)
+    def __init__(self, capacities: Sequence[int]) -> None:
+        self.capacities = list(capacities)
+        self._most = [dr.opaque(mi.UInt32, capacity) for capacity in capacities]
+        self._whole = [dr.zeros(mi.UInt32, count * len(_WHOLE)) for count in capacities]
+        self._floats = [dr.zeros(mi.Float, count * _FLOAT_COUNT) for count in capacities]
+        self._connections, self._merges = itertools.cycle(CONNECTIONS), itertools.cycle(MERGES)
         dr.eval(self._whole, self._floats)
 
     def choose(self, chosen: mi.Bool, rays: CameraRays) -> None:
@@ -98,23 +101,25 @@ class PathLog(Observer):
         return self._whole, self._floats, self._counts
 
     @property
-    def needed(self) -> int:
-        """The capacity that the pass needs."""
-        return max(int(count[0]) for count in self._counts)
+    def needed(self) -> list[int]:
+        """The capacities that the pass needs."""
+        return [int(count[0]) for count in self._counts]
 
     def rows(self) -> Rows:
         """The rows of the pass."""
         return Rows({kind: self._columns(kind) for kind in KINDS})
 
     def _columns(self, kind: int) -> dict[str, np.ndarray]:
-        count = min(int(self._counts[kind][0]), self.capacity)
+        count = min(int(self._counts[kind][0]), self.capacities[kind])
         if count == 0:
             return {name: np.zeros(0, np.uint32) for name in (*_WHOLE, *_FLOATS)}
-        first = kind * self.capacity
-        place = dr.arange(mi.UInt32, count * len(_WHOLE)) + first * len(_WHOLE)
-        whole = dr.gather(mi.UInt32, self._whole, place).numpy().reshape(count, -1)
-        place = dr.arange(mi.UInt32, count * _FLOAT_COUNT) + first * _FLOAT_COUNT
-        floats = dr.gather(mi.Float, self._floats, place).numpy().reshape(count, -1)
+        whole, floats = (
+            dr.gather(type(table), table, dr.arange(mi.UInt32, count * width)).numpy()
+            for table, width in (
+                (self._whole[kind], len(_WHOLE)), (self._floats[kind], _FLOAT_COUNT),
+            )
+        )  # fmt: skip
+        whole, floats = whole.reshape(count, -1), floats.reshape(count, -1)
         columns = {name: whole[:, index] for index, name in enumerate(_WHOLE)}
         ends = np.cumsum(list(_FLOATS.values()))[:-1]
         columns |= zip(_FLOATS, np.split(floats.astype(np.float64), ends, axis=1))
@@ -131,7 +136,7 @@ class PathLog(Observer):
         )  # fmt: skip
 
     def vertex(self, vertex, active) -> None:
-        self._depth, self._connections = vertex.depth, iter(CONNECTIONS)
+        self._depth = vertex.depth
 
     def connection(
         self, choice, vertex, ds, contribution, value, pdf, visible, tested
@@ -171,12 +176,15 @@ class PathLog(Observer):
 
     def merged(self, value, mis, competing, active) -> None:
         is_light = active & _is_light(value)
-        self._add(MERGED, self._depth, is_light, rgb=self._rgb(value), weight=mis)
+        self._add(next(self._merges), self._depth, is_light, rgb=self._rgb(value), weight=mis)
 
     def photon(self, value, carried, history, active) -> None:
         # The vertex may not be known yet: photons of media come before it
         is_light = active & _is_light(value)
-        self._add(MERGED, mi.UInt32(NO_DEPTH), is_light, rgb=self._rgb(value), weight=mi.Float(1))
+        self._add(
+            next(self._merges), mi.UInt32(NO_DEPTH), is_light, rgb=self._rgb(value),
+            weight=mi.Float(1),
+        )  # fmt: skip
 
     def splatted(self, s, position, value, mis, competing, active) -> None:
         pass
@@ -200,12 +208,11 @@ class PathLog(Observer):
         what they held: nobody reads them for this kind."""
         active = active & self._chosen
         slot = dr.scatter_inc(self._counts[kind], mi.UInt32(0), active)
-        active &= slot < self._most
-        slot += self._most * kind
+        active &= slot < self._most[kind]
         whole = {"lane": self._lane, "depth": depth}
         for place, name in enumerate(_WHOLE):
             if (value := whole.get(name, columns.get(name))) is not None:
-                dr.scatter(self._whole, mi.UInt32(value), slot * len(_WHOLE) + place, active)
+                dr.scatter(self._whole[kind], mi.UInt32(value), slot * len(_WHOLE) + place, active)
         place = 0
         for name, width in _FLOATS.items():
             value = columns.get(name)
@@ -213,7 +220,7 @@ class PathLog(Observer):
                 parts = [value] if width == 1 else list(value)
                 for offset, part in enumerate(parts):
                     target = slot * _FLOAT_COUNT + (place + offset)
-                    dr.scatter(self._floats, mi.Float(part), target, active)
+                    dr.scatter(self._floats[kind], mi.Float(part), target, active)
             place += width
 
 

@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .path_log import CONNECTIONS, EMISSION, IN_MEDIUM, JOINED, MERGED, SURVIVAL, VERTEX, Row, Rows
+from .path_log import CONNECTIONS, EMISSION, IN_MEDIUM, JOINED, MERGES, SURVIVAL, VERTEX, Row, Rows
 from .paths import FoundLight, Numbers, PathVertex
 
 _TECHNIQUES = {
-    EMISSION: "emission", JOINED: "light path", MERGED: "merge",
+    EMISSION: "emission", JOINED: "light path", **dict.fromkeys(MERGES, "merge"),
     **dict.fromkeys(CONNECTIONS, "connection"),
 }  # fmt: skip
 
@@ -84,7 +84,7 @@ class PathReader:
 
     def _light(self, kind: int, row: Row) -> FoundLight:
         rgb, mis = _numbers(row["rgb"]), float(row["weight"][0])
-        if kind in (JOINED, MERGED):
+        if kind == JOINED or kind in MERGES:
             count = int(row["flags"]) if kind == JOINED else None
             return FoundLight(_TECHNIQUES[kind], rgb, mis=mis, light_vertices=count)
         is_infinite = self._is_infinite(row)

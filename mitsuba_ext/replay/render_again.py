@@ -17,12 +17,13 @@ from ..scene.nesting import with_nested
 from ..transport.heroes import disperses
 from .bright_pixels import BrightPixelsJob
 from .passes_of_mitsuba import InOnePass, InPasses
+from .path_log import KINDS
 from .paths import FoundLight, PixelPaths, SamplePath, luminance
 from .reading import PathReader
 from .replay_job import PixelRecord, Recorded, ReplayJob
 
-#: The number of rows of a log at first. A replay that needs more starts again with as many.
-_CAPACITY = 1 << 18
+#: The number of rows of each kind in a log at first. A replay that needs more starts again.
+_CAPACITY = 1 << 16
 
 #: The least share of a sample that is reported as light of unknown origin: sums of the log and of
 #: the walk differ by rounding.
@@ -72,12 +73,9 @@ def paths_of_pixels(
         raise ValueError(f"top is {top}; it must be 1 or more")
     indices = [_index(sensor.film(), pixel) for pixel in pixels]
     render = _Render(scene, integrator, sensor, seed, spp, in_passes)
-    capacity = _CAPACITY
-    while True:
-        job = render.run(ReplayJob, indices, top, capacity)
-        if job.needed <= capacity:
-            break
-        capacity = 2 * job.needed
+    capacities = [_CAPACITY] * len(KINDS)
+    while (job := render.run(ReplayJob, indices, top, capacities)).needed != capacities:
+        capacities = job.needed
     reader = PathReader(scene)
     return [_paths(record, pixel, reader) for record, pixel in zip(job.records, pixels)]
 

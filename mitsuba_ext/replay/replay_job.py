@@ -87,20 +87,21 @@ class ReplayJob(Job):
     Parameters:
         pixels: The chosen pixels, row by row in the film's extent.
         top: The number of samples that are kept for each of them.
-        capacity: The number of rows that the log has.
+        capacities: See :class:`PathLog`.
 
     Attributes:
         records: What was recorded, one for each pixel.
-        needed: The number of rows that a pass would have needed.
+        needed: The capacities that the passes need.
     """
 
     freezes_passes = False
 
     def __init__(
-        self, integrator: Staged, request: Request, pixels: Sequence[int], top: int, capacity: int
-    ) -> None:
+        self, integrator: Staged, request: Request, pixels: Sequence[int], top: int,
+        capacities: Sequence[int],
+    ) -> None:  # fmt: skip
         super().__init__(integrator, request)
-        self._log, self._top, self.needed = PathLog(capacity), top, 0
+        self._log, self._top, self.needed = PathLog(capacities), top, list(capacities)
         self.records = [PixelRecord(pixel) for pixel in pixels]
         self._pixels = [dr.opaque(mi.UInt32, pixel) for pixel in pixels]
         self._stage, self._stage_index, self._left_out = None, -1, 0
@@ -142,7 +143,7 @@ class ReplayJob(Job):
         rgb = to_rgb(sample.L * rays.importance * rays.weight, wavelengths)
         rgb = mi.Color3f(rgb) + dr.zeros(mi.Color3f, dr.width(chosen))
         dr.eval(rgb, wavelengths, self.block.tensor(), self.tally, self._log.arrays)
-        self.needed = max(self.needed, self._log.needed)
+        self.needed = [max(pair) for pair in zip(self.needed, self._log.needed)]
         rows = self._log.rows()
         lanes = dr.compress(chosen)
         pixel = dr.gather(mi.UInt32, rays.pixel, lanes).numpy()
