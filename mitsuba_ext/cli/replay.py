@@ -236,7 +236,7 @@ def _print(pixel: PixelPaths) -> None:
         table = Table(
             "", "event", "shape", "BSDF", "position", "throughput", "pdf", "roulette",
             "light found by", "light", "pdf", "MIS", "radiance", title=_title(path),
-            title_justify="left", box=box.SIMPLE_HEAD,
+            title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
         )  # fmt: skip
         for row in _rows(path):
             table.add_row(*row)
@@ -289,8 +289,10 @@ def _light(light: FoundLight) -> list[str]:
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
+    if value is None:
+        return ""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return " ".join(f"{value:.3g}" for value in values)
+    return " ".join(map(_number, values))

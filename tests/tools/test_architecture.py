@@ -27,7 +27,7 @@ FLOORS = (
     ("scene", "startup"),
     ("images", "inputs", "transport"),
     ("rendering",),
-    ("long_renders", "planning"),
+    ("long_renders", "planning", "replay"),
     ("compare", "estimators", "techniques"),
     ("bases", "cli"),
     PLUGINS,
