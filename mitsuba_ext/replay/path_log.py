@@ -92,7 +92,7 @@ class PathLog(Observer):
         #: Turns the radiance along a ray into the radiance of a sample.
         self._importance = rays.importance * rays.weight
         self._wavelengths = rays.ray.wavelengths
-        dr.eval(self._chosen, self._lane, self._counts, self._importance, self._wavelengths)
+        dr.eval(self._chosen, self._counts)
 
     @property
     def arrays(self) -> tuple[Any, ...]:
@@ -111,15 +111,8 @@ class PathLog(Observer):
 
     def _columns(self, kind: int) -> dict[str, np.ndarray]:
         count = min(int(self._counts[kind][0]), self.capacities[kind])
-        if count == 0:
-            return {name: np.zeros(0, np.uint32) for name in (*_WHOLE, *_FLOATS)}
-        whole, floats = (
-            dr.gather(type(table), table, dr.arange(mi.UInt32, count * width)).numpy()
-            for table, width in (
-                (self._whole[kind], len(_WHOLE)), (self._floats[kind], _FLOAT_COUNT),
-            )
-        )  # fmt: skip
-        whole, floats = whole.reshape(count, -1), floats.reshape(count, -1)
+        whole = _first_rows(self._whole[kind], count, len(_WHOLE))
+        floats = _first_rows(self._floats[kind], count, _FLOAT_COUNT)
         columns = {name: whole[:, index] for index, name in enumerate(_WHOLE)}
         ends = np.cumsum(list(_FLOATS.values()))[:-1]
         columns |= zip(_FLOATS, np.split(floats.astype(np.float64), ends, axis=1))
@@ -222,6 +215,14 @@ class PathLog(Observer):
                     target = slot * _FLOAT_COUNT + (place + offset)
                     dr.scatter(self._floats[kind], mi.Float(part), target, active)
             place += width
+
+
+def _first_rows(table: mi.UInt32 | mi.Float, count: int, width: int) -> np.ndarray:
+    """The first rows of a table, [count, width]."""
+    if count == 0:
+        return np.zeros((0, width), np.uint32)
+    place = dr.arange(mi.UInt32, count * width)
+    return dr.gather(type(table), table, place).numpy().reshape(count, width)
 
 
 def _number(pointer: Any) -> mi.UInt32:

@@ -114,7 +114,8 @@ class ReplayJob(Job):
         for pixel in self._pixels:
             chosen |= rays.pixel == pixel
         is_alone = isinstance(stage.estimator, Walk) and not (stage.observer or stage.images)
-        if is_alone and not dr.any(chosen):
+        lanes = dr.compress(chosen)
+        if is_alone and len(lanes) == 0:
             return Sample(mi.Spectrum(0), mi.Bool(False))
         self._log.choose(chosen, rays)
         estimator = observed(stage.estimator, self._log)
@@ -122,7 +123,7 @@ class ReplayJob(Job):
             sample = estimator(self.scene, sampler, rays, chosen)
         else:
             sample = super()._sample(replace(stage, estimator=estimator), sampler, rays, count)
-        self._record(sample, rays, chosen, stage.weight)
+        self._record(sample, rays, chosen, lanes, stage.weight)
         return sample
 
     def fill_film(self) -> None:
@@ -137,20 +138,21 @@ class ReplayJob(Job):
                 self.records[index] = PixelRecord(record.index)
 
     def _record(
-        self, sample: Sample, rays: CameraRays, chosen: mi.Bool, weight: float
+        self, sample: Sample, rays: CameraRays, chosen: mi.Bool, lanes: mi.UInt32, weight: float
     ) -> None:
-        wavelengths = rays.ray.wavelengths
-        rgb = to_rgb(sample.L * rays.importance * rays.weight, wavelengths)
-        rgb = mi.Color3f(rgb) + dr.zeros(mi.Color3f, dr.width(chosen))
-        dr.eval(rgb, wavelengths, self.block.tensor(), self.tally, self._log.arrays)
+        # Only the chosen lanes are written to memory: there may be hundreds of millions of others
+        place, wavelengths = dr.prefix_sum(dr.select(chosen, mi.UInt32(1), 0)), rays.ray.wavelengths
+        rgb, nm = dr.zeros(mi.Color3f, len(lanes)), dr.zeros(type(wavelengths), len(lanes))
+        value = to_rgb(sample.L * rays.importance * rays.weight, wavelengths)
+        dr.scatter(rgb, mi.Color3f(value), place, chosen)
+        if mi.is_spectral:
+            dr.scatter(nm, wavelengths, place, chosen)
+        dr.eval(rgb, nm, self.block.tensor(), self.tally, self._log.arrays)
         self.needed = [max(pair) for pair in zip(self.needed, self._log.needed)]
         rows = self._log.rows()
-        lanes = dr.compress(chosen)
         pixel = dr.gather(mi.UInt32, rays.pixel, lanes).numpy()
-        values = weight * dr.gather(mi.Color3f, rgb, lanes).numpy().T.astype(np.float64)
-        nm = np.zeros((len(lanes), 0))
-        if mi.is_spectral:
-            nm = dr.gather(type(wavelengths), wavelengths, lanes).numpy().T.astype(np.float64)
+        values = weight * rgb.numpy().T.astype(np.float64)
+        nm = nm.numpy().T.astype(np.float64) if mi.is_spectral else np.zeros((len(lanes), 0))
         lanes = lanes.numpy()
         for record in self.records:
             (own,) = np.nonzero(pixel == record.index)

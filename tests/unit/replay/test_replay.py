@@ -190,6 +190,19 @@ def test_a_path_names_what_it_meets() -> None:
     assert sample.share == pytest.approx(1)
 
 
+def test_the_probability_of_roulette_is_shown(scenes) -> None:
+    scene, sensor = load(scenes)
+    (pixel,) = replay.paths_of_pixels(
+        scene, PIXELS[:1], path("composed_path", rr_depth=1), sensor, 7, 20, top=20
+    )
+    pairs = [pair for sample in pixel.paths for pair in zip(sample.vertices, sample.vertices[1:])]
+    assert len(pairs) > 5 and {vertex.event for vertex, _next in pairs} == {"diffuse reflection"}
+    for vertex, after in pairs:
+        # Roulette has divided the throughput by the probability, which is the throughput before
+        before = max(after.throughput) * vertex.survival
+        assert vertex.survival == pytest.approx(min(before, 0.95), rel=1e-5)
+
+
 def test_a_log_that_is_too_short_is_made_longer(scenes, monkeypatch) -> None:
     scene, sensor = load(scenes)
     arguments = scene, PIXELS[:1], path("composed_path"), sensor, 7, 20
