@@ -27,7 +27,7 @@ DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml scenes/
 # takes over tests that others have not begun.
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: demo test test-slow bench docs lint setup clean
+.PHONY: demo test test-slow bench docs stubs lint setup clean
 
 demo: setup
 	$(DEMO)
@@ -47,6 +47,10 @@ docs: setup $(VENV)/.installed_docs
 	$(BIN)/python -m sphinx -q -E -W --keep-going -d out/docs_work/pages -c docs/site . out/docs
 	$(BIN)/python docs/site/check.py out/docs
 	@echo "Open out/docs/index.html in a browser."
+
+# The signatures of mitsuba_ext.scene_description, from the pages of the plugins
+stubs: setup
+	$(BIN)/python -m mitsuba_ext.scene_description.stub
 
 lint: setup
 	$(BIN)/python -m ruff check .

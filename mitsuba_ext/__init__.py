@@ -21,7 +21,7 @@ from .util.version import __version__
 __all__ = ["__version__"]
 
 #: Public modules, which are imported when they are first used: they import Mitsuba.
-_MODULES = ("compare", "replay")
+_MODULES = ("compare", "replay", "scene_description")
 
 # An installed package contains the folders of plugins. In the source tree they are beside it.
 _folder = Path(__file__).parent

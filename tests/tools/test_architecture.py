@@ -25,7 +25,7 @@ _ARRAYS = ("Float", "Float64", "UInt32", "UInt64", "Int32", "Bool")
 FLOORS = (
     ("util",),
     ("scene", "startup"),
-    ("images", "inputs", "transport"),
+    ("images", "inputs", "scene_description", "transport"),
     ("rendering",),
     ("long_renders", "planning", "replay"),
     ("compare", "estimators", "techniques"),

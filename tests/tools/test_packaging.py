@@ -64,7 +64,7 @@ def test_authors_and_keywords_agree_with_the_citation() -> None:
 
 def test_internal_names_are_not_listed() -> None:
     public = [name for name in dir(mitsuba_ext) if not name.startswith("__")]
-    assert public == ["compare", "replay"] and mitsuba_ext.compare.Comparison
+    assert public == ["compare", "replay", "scene_description"] and mitsuba_ext.compare.Comparison
 
 
 def test_workflow_of_github_runs_the_steps_of_the_ci() -> None:
