@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..startup.pages import read_page
@@ -56,6 +56,8 @@ def _plain(value: Any) -> Any:
     for method in ("to_dict", "to_mi"):
         if hasattr(value, method):
             return getattr(value, method)()
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
     return value
 
 

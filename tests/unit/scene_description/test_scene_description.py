@@ -106,8 +106,10 @@ def test_objects_of_mitsuba_scene_description_are_accepted() -> None:
         "type": "moving", "nested": {"type": "sphere"}, "pose_0": "a transform",
         "pose_12": "a transform", "time_12": 0.5,
     }  # fmt: skip
-    several = scene_description.heightfield(nested=[_Described(), {"type": "diffuse"}])
-    assert several["nested_0"] == {"type": "sphere"} and several["nested_1"]["type"] == "diffuse"
+    lit = {"type": "twosided", "inner": _Described()}
+    several = scene_description.heightfield(nested=[lit, {"type": "diffuse"}])
+    assert several["nested_0"] == {"type": "twosided", "inner": {"type": "sphere"}}
+    assert several["nested_1"] == {"type": "diffuse"}
 
 
 def test_parameters_that_are_none_are_left_out() -> None:
