@@ -67,12 +67,13 @@ class BrightPixelsJob(Job):
             array.numpy().astype(np.float64) for array in (self._sums, self._peaks, self._weights)
         )
         others = np.maximum(sums - peaks, 0) / np.maximum(weights - 1, 1)
-        excess = (peaks - others) / np.maximum(weights, 1)
+        # Sums are exact to about 7 digits: less is no difference
+        differs = peaks - others > 1e-5 * peaks
+        excess = np.where(differs, (peaks - others) / np.maximum(weights, 1), 0)
         width, height = film_extent(self.film)
         border = (width - int(self.film.crop_size()[0])) // 2
         image = excess.reshape(height, width)
         image = image[border : height - border, border : width - border]
-        # Dr.Jit's sums are exact to 7 digits: less is no difference
         order = np.argsort(-image, axis=None, kind="stable")[:count]
         places = [divmod(int(index), image.shape[1]) for index in order]
         return [(x, y) for y, x in places if image[y, x] > 0]

@@ -53,7 +53,8 @@ class Rows:
         found = {}
         for kind, columns in self._columns.items():
             begin, end = np.searchsorted(columns["lane"], [lane, lane + 1])
-            found[kind] = {name: column[begin:end] for name, column in columns.items()}
+            # Copies, so that the rows of the other lanes can be freed
+            found[kind] = {name: column[begin:end].copy() for name, column in columns.items()}
         return Rows(found)
 
     def of_kind(self, kind: int) -> list[Row]:

@@ -129,6 +129,12 @@ class PixelPaths:
         return {**shown, "paths": [asdict(path) for path in self.paths]}
 
 
+def brightest_first(rgb: np.ndarray) -> np.ndarray:
+    """The order of these colours [number, 3] by brightness; NaN comes first."""
+    brightness = np.abs(luminance(rgb))
+    return np.argsort(-np.where(np.isnan(brightness), np.inf, brightness), kind="stable")
+
+
 def luminance(rgb: np.ndarray) -> np.ndarray:
     """The luminance of linear RGB, in the last axis."""
     return rgb @ np.array([0.212671, 0.715160, 0.072169])

@@ -18,7 +18,7 @@ from ..transport.heroes import disperses
 from .bright_pixels import BrightPixelsJob
 from .passes_of_mitsuba import InOnePass, InPasses
 from .path_log import KINDS
-from .paths import FoundLight, PixelPaths, SamplePath, luminance
+from .paths import FoundLight, PixelPaths, SamplePath, brightest_first, luminance
 from .reading import PathReader
 from .replay_job import PixelRecord, Recorded, ReplayJob
 
@@ -213,8 +213,7 @@ def _paths(record: PixelRecord, pixel: tuple[int, int], reader: PathReader) -> P
         *(values * by_number for values in record.splats), np.zeros((0, 3)),
     ])  # fmt: skip
     value = contributions.sum(axis=0)
-    brightness = luminance(contributions)
-    order = np.argsort(-np.where(np.isnan(brightness), np.inf, np.abs(brightness)), kind="stable")
+    order = brightest_first(contributions)
     whole = float(luminance(value))
     paths = []
     for one in record.brightest:

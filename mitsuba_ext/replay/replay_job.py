@@ -20,7 +20,7 @@ from ..transport.observer import Observers
 from ..transport.walk import Walk
 from ..util.spectra import to_rgb
 from .path_log import PathLog, Rows
-from .paths import luminance
+from .paths import brightest_first
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,8 @@ class PixelRecord:
     def keep(self, recorded: Sequence[Recorded], most: int) -> None:
         """Keeps the ``most`` brightest samples of those known and of ``recorded``."""
         self.brightest += recorded
-        self.brightest.sort(key=lambda one: _rank(one.rgb), reverse=True)
-        del self.brightest[most:]
-
-
-def _rank(rgb: np.ndarray) -> float:
-    """The order of samples: by brightness, but NaN first."""
-    value = float(luminance(rgb))
-    return np.inf if np.isnan(value) else abs(value)
+        order = brightest_first(np.array([one.rgb for one in self.brightest]).reshape(-1, 3))
+        self.brightest = [self.brightest[index] for index in order[:most]]
 
 
 class ReplayJob(Job):
@@ -159,13 +153,12 @@ class ReplayJob(Job):
             record.contributions.append(values[own])
             record.weights += weight * len(own)
             # The samples of a pixel are in neighbouring lanes, in the order of their numbers
-            order = sorted(range(len(own)), key=lambda n: _rank(values[own[n]]), reverse=True)
             record.keep([
                 Recorded(
-                    self.statistics.spp + n, self._stage_index, values[own[n]], weight, nm[own[n]],
-                    rows.of_lane(lanes[own[n]]),
+                    self.statistics.spp + int(n), self._stage_index, values[own[n]], weight,
+                    nm[own[n]], rows.of_lane(lanes[own[n]]),
                 )
-                for n in order[: self._top]
+                for n in brightest_first(values[own])[: self._top]
             ], self._top)  # fmt: skip
         for splats in sample.splats:
             self._record_splats(splats)
@@ -187,10 +180,9 @@ class ReplayJob(Job):
             values = mi.Color3f(to_rgb(value, nm)).numpy().T.astype(np.float64)
             nm = nm.numpy().T if mi.is_spectral else np.zeros((len(values), 0))
             record.splats.append(values)
-            order = sorted(range(len(values)), key=lambda n: _rank(values[n]), reverse=True)
             record.keep([
                 Recorded(None, self._stage_index, values[n], 0.0, nm[n], None)
-                for n in order[: self._top]
+                for n in brightest_first(values)[: self._top]
             ], self._top)  # fmt: skip
 
 
