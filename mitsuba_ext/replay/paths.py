@@ -20,7 +20,7 @@ class FoundLight:
             point on a light), ``light path`` (a connection to the end of a light path), ``merge``
             (with a light path that ends close to the vertex), ``light image`` (a light path reaches
             the sensor), or ``other`` (what the integrator adds without saying where, such as
-            interpolated irradiance).
+            interpolated irradiance, or takes away, as a clamp does).
         light: The light; empty if it is unknown.
         position: The point on the light, or the direction towards it if it is infinitely far away.
             ``None`` if it is unknown.

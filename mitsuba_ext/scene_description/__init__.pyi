@@ -103,6 +103,8 @@ def auto_path(
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -125,6 +127,8 @@ def auto_path(
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -217,6 +221,8 @@ def composed_path(
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -266,6 +272,7 @@ def composed_path(
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
+        clamp_direct, clamp_indirect (float): Biased. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -667,6 +674,8 @@ def neepp(
     slope: Any = 10,
     floor: Any = 0.1,
     refine: int = 16,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -702,6 +711,8 @@ def neepp(
             affine, 10, 0.1)
         refine (int): With rejection, and only if light sampling is not learned: the number of
             random visibility tests of visibility_roulette. (Default: 16)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -783,6 +794,8 @@ def pss_guided(
     keep_learned: bool = False,
     always_guide: bool = False,
     max_memory: float = 512,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -815,6 +828,8 @@ def pss_guided(
         always_guide (bool): Whether to guide all bounces, even if the pilots show that guiding does
             not pay. (Default: false)
         max_memory (float): Memory for what is recorded and learned, in MiB. (Default: 512)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -894,6 +909,8 @@ def reweighted_direct(
     pattern: str = "hammersley",
     weights: str = "",
     camera_samples: int = 0,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -923,6 +940,8 @@ def reweighted_direct(
             (Default: none)
         camera_samples (int): Samples per pixel of a render without spp; 0 for the number of the
             sensor's sampler, which is 4 by default. (Default: 0)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1092,6 +1111,8 @@ def swarm_path(
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -1131,6 +1152,8 @@ def swarm_path(
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1156,6 +1179,8 @@ def two_stage(
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
+    clamp_direct: float = 0,
+    clamp_indirect: float = 0,
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -1188,6 +1213,8 @@ def two_stage(
         save_learned, load_learned (string): With visibility maps: as in composed_path. (Default:
             none)
         keep_learned (bool): With visibility maps: as in composed_path. (Default: false)
+        clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
+            composed_path. (Default: 0)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)

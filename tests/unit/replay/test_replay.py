@@ -203,6 +203,16 @@ def test_the_probability_of_roulette_is_shown(scenes) -> None:
         assert vertex.survival == pytest.approx(min(before, 0.95), rel=1e-5)
 
 
+def test_what_a_clamp_cuts_off_is_shown(scenes) -> None:
+    scene, sensor = load(scenes)
+    clamped = path("composed_path", clamp_indirect=0.01)
+    image = clamped.render(scene, sensor, seed=7, spp=20)
+    (pixel,) = replay.paths_of_pixels(scene, PIXELS[:1], clamped, sensor, 7, 20)
+    np.testing.assert_allclose(pixel.value, pixel_of(image, PIXELS[0]), rtol=1e-5)
+    (rest,) = pixel.paths[0].lights
+    assert rest.technique == "other" and max(rest.radiance) < 0
+
+
 def test_a_log_that_is_too_short_is_made_longer(scenes, monkeypatch) -> None:
     scene, sensor = load(scenes)
     arguments = scene, PIXELS[:1], path("composed_path"), sensor, 7, 20
