@@ -13,6 +13,7 @@ import numpy as np
 from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.rendering.camera import develop as develop_film
 from mitsuba_ext.rendering.camera import find_sensor
+from mitsuba_ext.rendering.request import Watch
 from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.rendering.turns import in_turn, let_others, tell
 from mitsuba_ext.scene.nesting import refuse_checkpoint
@@ -125,6 +126,7 @@ class Variance(mi.AdjointIntegrator):
         )
         self.nested = self._nested(props)
         self.progress: Callable[[float], None] | None = None
+        self.watch: Watch | None = None
         self.statistics = RenderStatistics()
         self.is_cancelled = False
         self._aov_names = [
@@ -175,6 +177,9 @@ class Variance(mi.AdjointIntegrator):
         try:
             for batches in each_batch(self.nested, scene, sensor, batch_spp, seeds):
                 self._count(batch_spp)
+                if self.watch is not None and self.watch.is_due():
+                    self._fill(film, batches)
+                    self.watch.show(film, batches.spp, self.statistics)
                 if self.progress is not None:
                     tell(self.progress, batches.count / batch_count)
                 let_others()

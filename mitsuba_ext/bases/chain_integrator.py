@@ -217,7 +217,8 @@ class ChainIntegrator(WalkIntegrator):
             count = self.direct_samples or max(count, int(_DIRECT_SHARE * request.spp))
         request = replace(request, spp=count, develop=False, evaluate=False)
         if has_chains:
-            request = replace(request, timeout=request.timeout * _CAMERA_SHARE, progress=None)
+            timeout = request.timeout * _CAMERA_SHARE
+            request = replace(request, timeout=timeout, progress=None, watch=None)
         super().render_once(request)
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:

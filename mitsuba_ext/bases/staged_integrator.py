@@ -21,7 +21,7 @@ from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.device import SampleBytes
 from ..rendering.interrupts import interrupted
-from ..rendering.request import Request
+from ..rendering.request import Request, Watch
 from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
@@ -67,6 +67,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
     Attributes:
         sees_all: True, as it renders ``moving`` and lightweight shapes.
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
+        watch: Is shown the unfinished image after some of the passes
+            (:class:`~mitsuba_ext.rendering.request.Watch`); ``None`` if nobody watches.
         statistics: The statistics of the last render
             (:class:`~mitsuba_ext.rendering.statistics.RenderStatistics`).
     """
@@ -88,6 +90,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         if self.checkpoint:
             self.checkpoint_every = self._interval(props)
         self.progress: Callable[[float], None] | None = None
+        self.watch: Watch | None = None
         self.statistics = RenderStatistics()
         self.is_cancelled = False
 
@@ -162,7 +165,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         spp = self._checked(scene, spp) or self.default_spp
         sensor = camera.find_sensor(scene, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
-        own = {"timeout": self.timeout, "progress": self.progress}
+        own = {"timeout": self.timeout, "progress": self.progress, "watch": self.watch}
         known = [field.name for field in fields(Request)]
         for key in wishes:
             if key not in known:
@@ -225,7 +228,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         kept = KeptRender(self, Path(self.checkpoint), self.checkpoint_every, str(shown))
         state, is_interrupted = kept.run(
             request.scene, sensor, request.seed, request.spp,
-            request.timeout if request.is_timed else None, request.progress,
+            request.timeout if request.is_timed else None, request.progress, request.watch,
         )  # fmt: skip
         totals = state.totals
         self.statistics = RenderStatistics(

@@ -29,6 +29,7 @@ from .plugins import list_plugins
 from .render import render
 from .replay import replay
 from .supervisor import SUPERVISED
+from .view import view
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -51,7 +52,8 @@ def doctor() -> int:
 
 
 for command in (
-    render, merge, denoise, compare, diff, replay, list_plugins, doctor, export_blender, completion,
+    render, view, merge, denoise, compare, diff, replay, list_plugins, doctor, export_blender,
+    completion,
 ):  # fmt: skip
     cli.add_command(command)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from .render_job import RenderJob
 from .reports import Report
 from .stopping import stopping
 
+if TYPE_CHECKING:
+    from ..live.viewer import Viewer
+
 #: The fraction of the requested time below which the requested time is also shown.
 _USED = 0.8
 
@@ -47,6 +50,7 @@ class Order(NamedTuple):
     is_one_of_many: bool
     preview: Path | None
     changes: SceneChanges
+    viewer: Viewer | None = None
 
 
 def is_finished(order: Order, picture: Picture) -> bool:
@@ -165,6 +169,12 @@ def render_image(
                 report.warn(remark)
             if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)
+            if order.viewer:
+                job.viewer = order.viewer
+                order.viewer.begin(
+                    order.scene.stem, _facts(order, picture, job),
+                    getattr(job.integrator, "film_counts_samples", True),
+                )  # fmt: skip
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 report.note("compiling kernels (later renders like this one find them in a cache)")
@@ -184,6 +194,9 @@ def render_image(
             job.is_interrupted = not job.is_complete()
 
         stop.wait()
+        if order.viewer:
+            job.show(order.viewer)
+            order.viewer.is_interrupted = job.is_interrupted
         target = output
         is_kept = long is not None and long.folder is not None and not order.is_one_of_many
         if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
@@ -232,3 +245,17 @@ def render_image(
 def _noisy(path: Path) -> Path:
     """The file of the image before denoising."""
     return path.with_name(f"{path.stem}.noisy.exr")
+
+
+def _facts(order: Order, picture: Picture, job: RenderJob | LongJob) -> dict[str, str]:
+    """What a viewer says of the image."""
+    parameters = ", ".join(f"{key} {value}" for key, value in job.parameters.items())
+    return {
+        "title": picture.output.name,
+        "Scene": str(order.scene),
+        "Integrator": f"{job.name}{f' ({parameters})' if parameters else ''}",
+        "Seed": str(picture.seed),
+        **({"Frame": str(picture.frame)} if picture.frame is not None else {}),
+        **({"Sensor": str(picture.sensor)} if picture.sensor is not None else {}),
+        "Variant": order.variant,
+    }

@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..inputs.chosen import LastScene
+from ..live.kept_folder import of_state
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.executors import renderers
 from ..long_renders.folder import CheckpointFolder
@@ -26,6 +27,9 @@ from ..rendering.totals import RenderTotals
 from ..util.errors import InputError
 from .long_progress import LongProgress
 from .reports import Report
+
+if TYPE_CHECKING:
+    from ..live.viewer import Viewer
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class LongJob:
         failure: The error that ended the render after its first batch, or that kept its last state
             from being saved; ``None`` if there was none.
         seconds: Wall clock time of the render.
+        viewer: Is shown the image while it is rendered; ``None`` for nobody.
     """
 
     def __init__(
@@ -91,6 +96,7 @@ class LongJob:
         self.is_interrupted, self.seconds = False, 0.0
         self.failure: InputError | None = None
         self._state, self._render = RenderState(), None
+        self.viewer: Viewer | None = None
 
     def run(
         self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
@@ -147,6 +153,8 @@ class LongJob:
             show = LongProgress(report, bars, self.name, math.prod(self.film.crop_size()))
 
             def progress(render: LongRender) -> None:
+                if self.viewer and self.viewer.is_due():
+                    self.show(self.viewer)
                 show(render)
                 is_asked, is_due = asked(), is_due_at_once
                 if self._folder or options.has_preview:
@@ -202,6 +210,11 @@ class LongJob:
                 f"{folder}: already holds {kept} samples per pixel, and the image shows all of "
                 f"them, not {spp}"
             )
+
+    def show(self, viewer: Viewer) -> None:
+        """Shows the image to a viewer."""
+        error = self._render.error if self._render else None
+        viewer.present(lambda: of_state(self._state, error))
 
     # ---- The state of the render ----
 

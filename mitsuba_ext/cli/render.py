@@ -26,9 +26,10 @@ from .common import (
     scene_options,
 )
 from .frames import FrameRange, Sensors, pictures
+from .viewing import CommandWithTev, view_options, viewing
 
 
-@click.command(short_help="Render a scene to an image.")
+@click.command(cls=CommandWithTev, short_help="Render a scene to an image.")
 @click.option(
     "-o", "--output", type=FilledPath(), required=True, metavar="FILE",
     help="Image to write: .exr (all channels as floats, with metadata), .hdr or .pfm (RGB as "
@@ -102,6 +103,7 @@ from .frames import FrameRange, Sensors, pictures
     help="Denoise the image at the end, guided by the albedo and the normals of visible surfaces. "
     "The noisy image is kept in NAME.noisy.exr.",
 )
+@view_options("the render")
 @click.option("--quiet", is_flag=True, help="Show only warnings and errors.")
 @click.option(
     "--json", "as_json", is_flag=True,
@@ -132,6 +134,9 @@ def render(
     workers: int | None,
     dask: str | None,
     denoise: bool,
+    tev: str | None,
+    port: int | None,
+    control: bool,
     quiet: bool,
     as_json: bool,
     threads: int | None,
@@ -192,7 +197,8 @@ def render(
         raise click.UsageError("--parameters needs --frames")
     # Before the first batch and after the last one, SIGUSR1 is ignored: there is nothing to save
     ignored = requests_to_keep(signal.SIG_IGN) if is_long else contextlib.nullcontext()
-    with report.only_events(), ignored:
+    with report.only_events(), ignored, viewing(tev, port, control, report) as viewer:
+        order = order._replace(viewer=viewer)
         function = None
         if parameters is not None:
             from .frame_parameters import load_function

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.progress import Progress
@@ -19,6 +19,9 @@ from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..util.errors import InputError, one_line
 from .reports import Report, Speed, time_left
 
+if TYPE_CHECKING:
+    from ..live.viewer import Viewer
+
 
 class RenderJob:
     """The render of a scene by an integrator, and its progress.
@@ -31,6 +34,7 @@ class RenderJob:
         is_interrupted: Whether a signal ended the render before all samples were taken.
         failure: Always ``None``, because a failed render leaves no image.
         seconds: Wall clock time of the render.
+        viewer: Is shown the image while it is rendered; ``None`` for nobody.
     """
 
     def __init__(self, chosen: Chosen, seed: int) -> None:
@@ -44,6 +48,7 @@ class RenderJob:
         self._wanted: int | None = None  # samples per pixel to render, if known
         self._is_measuring = False
         self._passes: SeedPasses | None = None
+        self.viewer: Viewer | None = None
 
     def run(
         self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
@@ -124,16 +129,26 @@ class RenderJob:
         if seconds is None:
             self._wanted = sample_count(self.sensor, spp or 0)
         if self._passes is not None:
-            self._passes.run(self._wanted or 0, seconds, progress)
+            self._passes.run(self._wanted or 0, seconds, progress, self.viewer)
             self.is_interrupted = self._passes.interrupted
             return
         if hasattr(self.integrator, "progress"):
             self.integrator.progress = progress
+        if self.viewer and hasattr(self.integrator, "watch"):
+            self.integrator.watch = self.viewer
         index = self.chosen.sensor_index
-        if seconds is not None:
-            timing.render_for(seconds, self.integrator, self.scene, self._seed, index)
-        else:
-            timing.timed_render(self.integrator, self.scene, self._seed, spp or 0, index)
+        try:
+            if seconds is not None:
+                timing.render_for(seconds, self.integrator, self.scene, self._seed, index)
+            else:
+                timing.timed_render(self.integrator, self.scene, self._seed, spp or 0, index)
+        finally:
+            if self.viewer and hasattr(self.integrator, "watch"):
+                self.integrator.watch = None
+
+    def show(self, viewer: Viewer) -> None:
+        """Shows the image of the film to a viewer."""
+        viewer.show(self.film, self.spp or 0, timing.own_statistics(self.integrator))
 
     def variance(self) -> dict[str, np.ndarray]:
         """The channels with the variance of the image: none, because it is unknown."""

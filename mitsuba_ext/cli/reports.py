@@ -8,13 +8,16 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.progress import Progress, TextColumn
 
 from ..compare.progress import progress_bars
 from .common import say
+
+if TYPE_CHECKING:
+    from ..live.viewer import Viewer
 
 #: The minimum time between two progress events, in seconds.
 _PERIOD = 1.0
@@ -32,6 +35,8 @@ class Report:
         self._is_quiet, self._as_json = is_quiet, as_json
         self._last = -_PERIOD
         self._events = sys.stdout
+        #: Who else is told of the progress.
+        self.viewer: Viewer | None = None
         #: The image whose progress is reported; empty if there is only one.
         self.image: dict[str, Any] = {}
 
@@ -47,10 +52,20 @@ class Report:
             say(f"mitsuba-ext: warning: {text}")
 
     def progress(self, **figures: Any) -> None:
-        """Emits a progress event; figures that are ``None`` are omitted."""
+        """Emits a progress event; figures that are ``None`` are omitted. A viewer that has paused
+        the render holds it here."""
+        if self.viewer:
+            self.viewer.tell(**figures)
         if self._as_json and not self._is_quiet and time.monotonic() - self._last >= _PERIOD:
             self._last = time.monotonic()
             self._event("progress", **self.image, **figures)
+
+    def page(self, address: str) -> None:
+        """Names the page that shows the render, even in a quiet report."""
+        if self._as_json:
+            self._event("page", address=address)
+        else:
+            say(f"the render is shown at {address}")
 
     def end(
         self, text: str, details: Sequence[str] = (), is_interrupted: bool = False, **figures: Any

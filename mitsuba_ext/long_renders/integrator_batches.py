@@ -128,7 +128,8 @@ class IntegratorBatches:
         if is_staged(integrator):
             # Batches may be rendered in any order: count as if all had the usual length
             before = batch.index * max(batch.spp, self.length(_LARGER_THAN_A_BATCH, False))
-            wishes.update(samples_before=before, is_batch=True, timeout=-1.0, progress=None)
+            wishes.update(samples_before=before, is_batch=True, timeout=-1.0)
+            wishes.update(progress=None, watch=None)  # of batches, nothing is shown
         images = next(
             each_batch(integrator, self._scene, self.sensor, batch.spp, [seed], **wishes)
         )

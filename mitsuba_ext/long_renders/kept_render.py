@@ -13,6 +13,7 @@ import mitsuba as mi
 from ..inputs.content_hash import hash_code
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
+from ..rendering.request import Watch
 from ..rendering.turns import tell
 from ..scene.fingerprint import fingerprint
 from ..scene.nesting import with_nested
@@ -48,6 +49,7 @@ class KeptRender:
         spp: int,
         seconds: float | None = None,
         progress: Callable[[float], None] | None = None,
+        watch: Watch | None = None,
     ) -> tuple[RenderState, bool]:
         """Renders the missing batches, and puts the image of all batches into the film. Returns the
         state of the render, and whether it was interrupted.
@@ -56,6 +58,7 @@ class KeptRender:
             spp: Samples per pixel of the whole image; 0 for the sampler's number.
             seconds: The time limit of this call, in seconds; ``None`` for none.
             progress: A function that is called after each batch with the fraction done.
+            watch: Is shown the unfinished image; ``None`` if nobody watches.
 
         Raises:
             InputError: The folder holds another render, or cannot be used.
@@ -79,6 +82,9 @@ class KeptRender:
                 if last.is_due(self._every, state.spp):
                     last.mark(state.spp)
                     self._save(state)
+                if watch is not None and watch.is_due():
+                    state.fill(sensor.film())
+                    watch.show(sensor.film(), state.spp, None)
                 if progress is not None:
                     tell(progress, min(1.0, state.spp / (render.goal_spp or goal.spp)))
 

@@ -84,6 +84,7 @@ class AdaptiveJob(Job):
             passes = max(1, round(budget / (self._pass_spp * self.plan.pixel_count)))
             sets, weight = self.allocation.next(budget / passes, passes == 1, 1 / passes)
             self._run_sets(stage, sets, weight)
+            self._show()
             if self.request.progress is not None:
                 is_done = passes == 1 or not self.allocation.has_active
                 done = self.moments.total

@@ -6,6 +6,7 @@ This module does not import Mitsuba at the top: the command line installs its ha
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import threading
 import time
@@ -65,6 +66,20 @@ class InterruptHandler:
         import mitsuba as mi
 
         mi.Log(mi.LogLevel.Warn, "Interrupted: finishing the running pass.")
+
+
+def is_end_requested() -> bool:
+    """Whether a signal has asked the running render to end after its pass."""
+    handlers = [signal.getsignal(number) for number in SIGNALS]
+    events = [handler.event for handler in handlers if isinstance(handler, InterruptHandler)]
+    return any(event is not None and event.is_set() for event in events)
+
+
+def request_end() -> None:
+    """Ends the render of this process as Ctrl-C does. Any thread may call this."""
+    heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    if heard:
+        os.kill(os.getpid(), heard[0])
 
 
 def interrupted(plugin: str) -> KeyboardInterrupt:

@@ -207,6 +207,7 @@ class Job:
                 stage.images.add(self.block, self.splats, before + done)
             if not compiled:
                 known.passed(spp, done, timer.seconds)
+            self._show()
             if self.request.progress is not None:
                 is_known = is_last and not known.is_open
                 wanted = max(done, self.plan.whole(before, known.samples, samples))
@@ -373,6 +374,16 @@ class Job:
         if self.splats is not None and self.statistics.spp > 0:
             tensor, offset = self.splats.tensor(), self.splats.offset()
             put_splats(self.film, tensor, offset, self.statistics.spp - self.forgotten)
+
+    def _show(self) -> None:
+        """Shows the image so far, if somebody watches and wants to see it now."""
+        watch = self.request.watch
+        if watch is not None and watch.is_due():
+            block = self.block
+            self.fill_film()
+            watch.show(self.film, self.statistics.spp - self.forgotten, self.statistics)
+            self.film.clear()
+            self.block = block  # subclasses put another one into the film
 
     def finish(self) -> None:
         statistics = self.statistics

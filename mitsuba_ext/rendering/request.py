@@ -4,9 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import mitsuba as mi
+
+from .statistics import RenderStatistics
+
+
+class Watch(Protocol):
+    """Whoever watches a render (:class:`mitsuba_ext.live.viewer.Viewer`)."""
+
+    def is_due(self) -> bool:
+        """Whether it wants to see the image now. Called after each pass."""
+
+    def show(self, film: mi.Film, spp: int, statistics: RenderStatistics | None) -> None:
+        """Called if it does.
+
+        Args:
+            film: Holds the image so far.
+            spp: Samples per pixel of that image.
+            statistics: What the render says of itself; ``None`` for Mitsuba's integrators.
+        """
 
 
 @dataclass(frozen=True)
@@ -20,6 +38,7 @@ class Request:
         develop, evaluate: See ``mi.Integrator.render``.
         timeout: Seconds after which to stop; 0 or less for no limit.
         progress: Called after each pass with the fraction done; ``None`` for no calls.
+        watch: Is shown the unfinished image; ``None`` if nobody watches.
         is_batch: Whether it is one of several batches of a render. A batch is not saved in the
             folder ``checkpoint``, and does not forget that the render was cancelled before it.
         samples_before: Samples per pixel of the batches with smaller numbers.
@@ -37,6 +56,7 @@ class Request:
     evaluate: bool = True
     timeout: float = -1.0
     progress: Callable[[float], None] | None = None
+    watch: Watch | None = None
     is_batch: bool = False
     samples_before: int = 0
     save_learned: str = ""

@@ -21,6 +21,7 @@ from .film_sums import FilmSums
 from .interrupts import deferred_interrupt
 from .pace import Pace
 from .plan import check_extent, is_independent
+from .request import Watch
 from .statistics import PassTimer
 
 #: Approximate number of samples of a pass: one or two seconds on two CPU cores. It must not depend
@@ -113,6 +114,7 @@ class SeedPasses:
         spp: int,
         seconds: float | None = None,
         progress: Callable[[float], None] = lambda done: None,
+        watch: Watch | None = None,
     ) -> None:
         """Renders, and leaves the image of the finished passes in the film, also after an exception
         and after Ctrl-C, which ends the render after the running pass. With a single pass, the
@@ -125,6 +127,7 @@ class SeedPasses:
                 not depend on the times of later passes: stopping by the clock would be biased
                 towards samples that are fast.
             progress: Called after each pass with the fraction done.
+            watch: Is shown the unfinished image; ``None`` if nobody watches.
         """
         length = pass_length(self._sensor, seconds is not None)
         pass_count = -(-spp // length) if seconds is None else math.inf
@@ -140,11 +143,17 @@ class SeedPasses:
                         pace.measure(1, elapsed)
                         pass_count = max(self.passes, round(pace.fits(seconds)))
                     self.interrupted = self.passes < pass_count
+                    if watch is not None and watch.is_due():
+                        self._fill()
+                        watch.show(self._film, self.spp, None)
                     progress(self.passes / pass_count)
         finally:
             self._sensor.sampler().set_sample_count(asked)  # Mitsuba's integrators change it
             if self.passes > 0:
-                self._sums.fill(self._film, self._integrator.aov_names())
+                self._fill()
+
+    def _fill(self) -> None:
+        self._sums.fill(self._film, self._integrator.aov_names())
 
     def _run_pass(self, spp: int) -> tuple[float, bool]:
         """Adds a pass; returns its seconds, and whether it compiled a kernel."""

@@ -28,7 +28,7 @@ FLOORS = (
     ("images", "inputs", "scene_description", "transport"),
     ("rendering",),
     ("long_renders", "planning", "replay"),
-    ("compare", "estimators", "techniques"),
+    ("compare", "estimators", "live", "techniques"),
     ("bases", "cli"),
     PLUGINS,
 )

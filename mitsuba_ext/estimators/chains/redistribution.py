@@ -121,13 +121,16 @@ class RedistributionRender(ChainRender):
             self._batch(image, rules, size, deposit)
             return 1
 
+        def write() -> None:
+            factor = self._pixel_count * self._camera_spp / self._samples
+            image.write(factor, factor, self._camera_spp)
+
         try:
-            is_done = left == 0 or self._repeat(-(-left // size), size, interrupt, act)
+            is_done = left == 0 or self._repeat(-(-left // size), size, interrupt, act, write)
             statistics.interrupted = not is_done
         finally:
             if self._batches > 0:
-                factor = self._pixel_count * self._camera_spp / self._samples
-                image.write(factor, factor, self._camera_spp)
+                write()
                 self._report(round(self._samples / self._pixel_count))
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"

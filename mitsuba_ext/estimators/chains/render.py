@@ -74,13 +74,15 @@ class ChainRender:
         return SteppedChains if self._target.has_light_paths else LoopedChains
 
     def _repeat(
-        self, count: int, width: int, interrupt: threading.Event, act: Callable[[int], int]
-    ) -> bool:
+        self, count: int, width: int, interrupt: threading.Event, act: Callable[[int], int],
+        write: Callable[[], None],
+    ) -> bool:  # fmt: skip
         """Calls ``act`` until ``count`` steps, or as many as the time limit allows, have been made.
 
         Parameters:
             width: The number of lanes of a step.
             act: A function of the maximum number of steps that returns the number it made.
+            write: Adds the image of the steps so far to the film.
 
         Returns:
             False if the render was interrupted or cancelled before the end.
@@ -98,9 +100,20 @@ class ChainRender:
             if not timer.has_new_kernels:
                 steps.passed(made, done, timer.seconds)
             self._statistics.passes += 1
+            self._show(write, round(done * width / self._pixel_count))
             if request.progress is not None:
                 tell(request.progress, min(1.0, done / steps.samples))
         return True
+
+    def _show(self, write: Callable[[], None], spp: int) -> None:
+        """Shows the image so far, if somebody watches and wants to see it now."""
+        watch, film = self._request.watch, self._film
+        if watch is not None and watch.is_due():
+            of_camera = film.develop(raw=True)
+            write()
+            watch.show(film, spp, self._statistics)
+            film.clear()
+            film.put_block(mi.ImageBlock(of_camera, offset=film.crop_offset()))
 
     def _count(self, counts: MutationCounts, mutations: int) -> None:
         longest = float(dr.max(counts.longest)[0])

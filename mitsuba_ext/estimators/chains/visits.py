@@ -135,9 +135,12 @@ class MetropolisRender(ChainRender):
             self._count(chains.advance(length), length * count)
             return length
 
+        def put() -> None:
+            self._put(chains, image, start)
+
         try:
             left = max(0, -(-total // count) - chains.done)
-            is_done = left == 0 or self._repeat(left, count, interrupt, act)
+            is_done = left == 0 or self._repeat(left, count, interrupt, act, put)
             statistics.interrupted = not is_done
         finally:
             if chains.done > 0:
@@ -236,7 +239,8 @@ class MetropolisRender(ChainRender):
         left = self._request.timeout - (time.perf_counter() - self._start)
         return int(pace.fits(_BOOTSTRAP_TIME * left))
 
-    def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
+    def _put(self, chains: Chains, image: ChainImage, start: Start) -> int:
+        """Adds the image to the film. Returns the number of mutations."""
         mutations = chains.done * chains.count
         camera_samples = self._pixel_count * self._camera_spp
         # The mean of the samples at which the chains started, not a more precise one: only with
@@ -245,6 +249,10 @@ class MetropolisRender(ChainRender):
         uniform = self._settings.large_step * mutations + start.count
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
         image.write(visit_factor, uniform_factor, self._camera_spp)
+        return mutations
+
+    def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
+        mutations = self._put(chains, image, start)
         self._report(round(mutations / self._pixel_count))
         longest = self._counts["longest"]
         self._statistics.learned = (

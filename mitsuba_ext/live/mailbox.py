@@ -1,0 +1,59 @@
+"""A thread that works on the newest of each kind of item."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+
+class Mailbox:
+    """Hands items to a function in a thread of its own. Whoever puts an item never waits: if the
+    function takes long, or forever, later items of a name replace earlier ones.
+
+    Parameters:
+        take: A function of a name and the newest item of this name.
+        spent: A function that is called with the CPU time of each call of ``take``, in seconds.
+    """
+
+    def __init__(
+        self, take: Callable[[str, Any], None],
+        spent: Callable[[float], None] = lambda seconds: None,
+    ) -> None:  # fmt: skip
+        self._take, self._spent = take, spent
+        self._items: dict[str, Any] = {}
+        self._is_working = self._is_closed = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def put(self, name: str, item: Any) -> None:
+        with self._changed:
+            self._items[name] = item
+            self._changed.notify_all()
+
+    def close(self, seconds: float) -> bool:
+        """Waits until all items are taken, but not longer than ``seconds``. Returns whether they
+        are."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+            return self._changed.wait_for(lambda: not (self._items or self._is_working), seconds)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._items or self._is_closed)
+                if not self._items:
+                    return
+                name = next(iter(self._items))
+                item, self._is_working = self._items.pop(name), True
+            begin = time.thread_time()
+            try:
+                self._take(name, item)
+            finally:
+                with self._changed:
+                    self._is_working = False
+                    self._changed.notify_all()
+            del item  # it may be large
+            self._spent(time.thread_time() - begin)
