@@ -24,12 +24,15 @@ from .common import (
     say,
     scene_options,
 )
+from .viewing import CommandWithTev, Sayings, of_runs, view_options, viewing
 
 if TYPE_CHECKING:
+    from ..compare.progress import Step
+    from ..live.viewer import Viewer
     from ..long_renders.divided_references import ReferenceWorkers
 
 
-@click.command(short_help="Measure the speed and the error of integrators on scenes.")
+@click.command(cls=CommandWithTev, short_help="Measure the speed and the error of integrators on scenes.")
 @click.option(
     "--spp", type=click.IntRange(min=1), metavar="N",
     help="Equal samples: N per pixel for each run.",
@@ -83,6 +86,7 @@ if TYPE_CHECKING:
     help="Time limit of a render in seconds, including compilation. An integrator that takes "
     "longer is stopped and reported as failed; the others continue. References have no limit.",
 )
+@view_options("the images of finished runs")
 @executor_options("Render references", " Measured runs use one process.")
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
@@ -106,6 +110,9 @@ def compare(
     cpu: bool,
     out: Path,
     limit: float | None,
+    tev: str | None,
+    port: int | None,
+    control: bool,
     workers: int | None,
     dask: str | None,
     worker: str | None,
@@ -152,7 +159,9 @@ def compare(
         return supervisor.supervise(sys.argv[1:], out, limit or math.inf)
     elif limit is not None:
         raise click.UsageError("--limit needs worker processes, which only the command has")
-    from ..compare import Comparison, SceneChanges, SceneSetup, budgets, show
+    from ..compare import Comparison, SceneChanges, SceneSetup, budgets
+    from ..compare import show as show_tables
+    from ..compare.progress import reporting
 
     make = {
         "--spp": budgets.equal_samples, "--time": budgets.equal_time,
@@ -161,7 +170,11 @@ def compare(
     (budget,) = (make[name](value) for name, value in given.items() if value is not None)
     select_variant(variant, plugins)
     changes = SceneChanges(crop, rfilter, max_depth)
-    executors = contextlib.ExitStack()
+    stack = contextlib.ExitStack()
+    is_stored = worker == supervisor.STORED
+    viewer = None
+    if not is_stored:
+        viewer = stack.enter_context(viewing(tev, port, control, Sayings()))
     comparison = Comparison(
         [SceneSetup(scene, size, dict(definitions), reference, changes) for scene in scenes],
         integrators,
@@ -171,29 +184,48 @@ def compare(
         reference_spp=reference_spp,
         reference_integrator=reference_integrator,
         command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
-        only_stored=worker == supervisor.STORED,
+        only_stored=is_stored,
         with_reference=not no_reference,
         cpu_time=cpu,
-        reference_workers=_reference_workers(executors, workers, dask, tuple(plugins)),
+        reference_workers=_reference_workers(stack, workers, dask, tuple(plugins)),
         warn=lambda remark: say(f"mitsuba-ext: warning: {remark}"),
+        watch=(lambda name, runs: viewer.present(lambda: of_runs(runs), name)) if viewer else None,
     )
-    interrupted = worker == supervisor.STORED
+    interrupted = is_stored
     try:
-        with executors:
-            comparison.run()
+        with stack, reporting(True) as progress:
+            if viewer:
+                viewer.begin("", _facts(scenes, integrators, given))
+                show, progress = progress, lambda step: (_tell(viewer, step), show(step))
+            comparison.run(progress)
     except KeyboardInterrupt:
         interrupted = True
     results = comparison.results()
     if not results["scenes"]:
         say("interrupted before the first run: nothing written")
         return INTERRUPTED
-    show(results)
+    show_tables(results)
     for name in ("results.json", "report.html"):
         click.echo(out / name)
     if interrupted:
         say("interrupted: the results cover only the finished runs")
         return INTERRUPTED
     return 1 if any(map(_has_trouble, results["scenes"])) else 0
+
+
+def _facts(
+    scenes: Sequence[Path], integrators: Sequence[str], budget: Mapping[str, Any]
+) -> dict[str, str]:
+    """What a viewer says of the comparison."""
+    (option,) = (f"{name} {value}" for name, value in budget.items() if value is not None)
+    return {
+        "title": f"{', '.join(integrators)}", "Scene": ", ".join(map(str, scenes)),
+        "Budget": option,
+    }  # fmt: skip
+
+
+def _tell(viewer: Viewer, step: Step) -> None:
+    viewer.tell(doing=step.label, seconds=step.done, seconds_left=step.left)
 
 
 def _reference_workers(

@@ -121,7 +121,7 @@ class RenderJob:
                 bar, description=text, total=1.0, completed=done, left=time_left(left)
             )
             report.progress(
-                done=done, spp=self._passes.spp if self._passes else None,
+                done=done, spp=self._passes.spp if self._passes else None, goal_spp=self._wanted,
                 samples_per_second=samples, seconds=time.perf_counter() - begin, seconds_left=left,
             )  # fmt: skip
 

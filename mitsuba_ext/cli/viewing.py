@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import click
 
+from .common import say
+
 if TYPE_CHECKING:
+    from ..compare.runs import Run
+    from ..live.snapshot import Snapshot
     from ..live.viewer import Viewer
 
 #: Where tev listens by default.
@@ -24,6 +28,18 @@ class Output(Protocol):
     def page(self, address: str) -> None: ...
 
     def warn(self, text: str) -> None: ...
+
+
+class Sayings:
+    """An output that prints everything on stderr."""
+
+    viewer: Viewer | None = None
+
+    def page(self, address: str) -> None:
+        say(f"shown at {address}")
+
+    def warn(self, text: str) -> None:
+        say(f"mitsuba-ext: warning: {text}")
 
 
 class CommandWithTev(click.Command):
@@ -92,3 +108,22 @@ def viewing(
     finally:
         output.viewer = None
         viewer.close(INTERRUPTED if viewer.is_interrupted else phase)
+
+
+def of_runs(runs: Sequence[Run]) -> Snapshot:
+    """A snapshot of the mean of the runs of an integrator at one level; its variance is the one
+    between seeds, and its error the mean of their errors."""
+    import numpy as np
+
+    from ..live.snapshot import Snapshot
+
+    images = np.stack([run.image() for run in runs])
+    errors = [run.errors.relmse for run in runs if run.errors]
+    newest, count = runs[-1], len(runs)
+    return Snapshot(
+        images.mean(axis=0), ("R", "G", "B"), 3, newest.spp,
+        sum(run.seconds for run in runs) / count,
+        variance=images.var(axis=0, ddof=1) / count if count > 1 else None,
+        error=sum(errors) / count if errors else None, learned=newest.learned,
+        is_error_measured=bool(errors),
+    )  # fmt: skip

@@ -28,7 +28,7 @@ from ..util.marks import REFERENCES, in_use
 from . import references, results, timing
 from .budgets import Budget
 from .contenders import make_all
-from .experiment import Experiment
+from .experiment import Experiment, Watch
 from .notebook import Results
 from .progress import Step, reporting
 from .reference_choice import choose_integrator
@@ -91,6 +91,8 @@ class Comparison:
             programs on the machine hardly change it.
         warn: A function that is called with each remark about a scene, its reference and its stored
             runs as soon as it is known; the results also hold the remarks.
+        watch: A function that is called after each run with the name of its image, which names the
+            scene if there are several, and with all runs of its integrator at its level.
 
     Raises:
         InputError: No scene was given, an integrator cannot be made, ``budget`` is not a
@@ -114,6 +116,7 @@ class Comparison:
         cpu_time: bool = False,
         reference_workers: ReferenceWorkers | None = None,
         warn: Callable[[str], None] = lambda remark: None,
+        watch: Watch | None = None,
     ) -> None:
         self.only_stored = only_stored
         self.scenes = _setups(scenes)
@@ -149,7 +152,7 @@ class Comparison:
         self._reference_spp = reference_spp
         self._reference_integrator = reference_integrator
         self._reference_workers = reference_workers
-        self._warn = warn
+        self._warn, self._watch = warn, watch
         self._temporary = None
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="mitsuba_ext_")
@@ -234,7 +237,7 @@ class Comparison:
         )  # fmt: skip
         experiment = Experiment(
             scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored,
-            self._cpu_time, self._warn,
+            self._cpu_time, self._warn, self._watch and self._shown(name),
         )  # fmt: skip
 
         def report_step(step: Step) -> None:
@@ -253,6 +256,10 @@ class Comparison:
         self._running = (name, experiment)
         experiment.run(reference, report_step)
         self._keep_record()
+
+    def _shown(self, scene: str) -> Watch:
+        prefix = f"{scene}: " if len(self.scenes) > 1 else ""
+        return lambda label, runs: self._watch(f"{prefix}{label}", runs)
 
     def _reference_of(
         self, setup: SceneSetup, experiment: Experiment, progress: Callable[[Step], None]

@@ -37,6 +37,9 @@ from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
 
+#: Is shown the runs of an integrator: its label, and its runs at one level.
+Watch = Callable[[str, Sequence[Run]], None]
+
 #: With a time budget, the maximum relative deviation of a run's time, and the maximum number of
 #: attempts: a run that misses its time is repeated with a corrected number of samples.
 TIME_TOLERANCE = 0.05
@@ -59,6 +62,8 @@ class Experiment:
         only_stored: Whether to use only the stored runs and render nothing.
         cpu_time: Whether to measure the CPU time of all threads instead of the wall clock.
         warn: A function that is called with each sentence added to :attr:`remarks`.
+        watch: A function that is called with the label of an integrator, and its runs at a level,
+            after each of them; the time that it takes is not measured.
 
     Attributes:
         remarks: Remarks about the scene, its reference and the folder.
@@ -77,11 +82,12 @@ class Experiment:
         only_stored: bool = False,
         cpu_time: bool = False,
         warn: Callable[[str], None] = lambda remark: None,
+        watch: Watch | None = None,
     ) -> None:
         self.only_stored = only_stored
         self._cpu_time = cpu_time
         self.remarks: list[str] = []
-        self._warn = warn
+        self._warn, self._watch = warn, watch
         self.scene = scene
         self.budget = budget
         self.rounds = rounds
@@ -203,6 +209,8 @@ class Experiment:
         self._done += run.seconds
         if not self.only_stored:
             self._share_session(contender, run)
+        if self._watch:
+            self._watch(contender.label, contender.at(run.level))
 
     def _compare_seeds(self) -> None:
         """Measures the errors of all runs between the seeds of each integrator and level."""

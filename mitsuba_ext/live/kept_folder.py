@@ -19,7 +19,7 @@ from .snapshot import Snapshot
 _MIN_BATCHES = 8
 
 
-def of_state(state: RenderState, error: float | None) -> Snapshot:
+def of_state(state: RenderState, error: float | None, seconds: float = 0.0) -> Snapshot:
     """A snapshot of the image of all batches, whose relMSE is ``error``."""
     batches = state.images
     colours = [name for name in batches.channels[: batches.image_channel_count] if name != "A"]
@@ -28,7 +28,7 @@ def of_state(state: RenderState, error: float | None) -> Snapshot:
         variance = batches.variance[..., : len(colours)].astype(np.float32)
     return Snapshot(
         batches.mean.astype(np.float32), batches.channels, batches.image_channel_count, batches.spp,
-        variance, error, state.totals.learned, dict(state.totals.effects),
+        seconds, variance, error, state.totals.learned, dict(state.totals.effects),
     )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ class KeptFolder:
             "Saved": when,
         }
         figures = {"spp": state.spp, "seconds": state.totals.render_seconds}
-        return facts, figures, of_state(state, error)
+        return facts, figures, of_state(state, error, state.totals.render_seconds)
 
     def _renders(self) -> Iterator[Path]:
         for folder in (self._path, *sorted(self._path.glob("*/"))):

@@ -24,6 +24,7 @@ class Snapshot:
         channels: The names of the channels: the film's image, then AOVs.
         image_channel_count: The number of channels of the film's image, alpha included.
         spp: Samples per pixel.
+        seconds: The time of the render until then.
         variance: The variance of the first channels of ``image`` (without alpha), as far as it is
             known; otherwise ``None``.
         error: The relMSE, estimated from the variance, or measured; ``None`` if it is unknown.
@@ -36,6 +37,7 @@ class Snapshot:
     channels: tuple[str, ...]
     image_channel_count: int
     spp: int
+    seconds: float = 0.0
     variance: np.ndarray | None = None
     error: float | None = None
     learned: str = ""

@@ -93,7 +93,7 @@ class Viewer:
         self.phase, self.is_interrupted = phase, False
         self._name, self._counts_samples = "", True
         self._is_first = self._is_free = True
-        self._due = 0.0
+        self._due, self._begin = 0.0, time.monotonic()
         self._increments = Increments()
         self._boxes = [Mailbox(receiver.receive, self.spent) for receiver in receivers]
         self._prepared = Mailbox(self._hand_on, self.spent)
@@ -111,7 +111,7 @@ class Viewer:
         """
         self._name, self._counts_samples = name, counts_samples
         self._increments = Increments()
-        self._due = 0.0
+        self._due, self._begin = 0.0, time.monotonic()
         for receiver in self._receivers:
             receiver.begin()
             receiver.describe(facts)
@@ -141,6 +141,8 @@ class Viewer:
         """
         begin = time.monotonic()
         snapshot = make()
+        if not snapshot.seconds:
+            snapshot = replace(snapshot, seconds=time.monotonic() - self._begin)
         self._wait_for_next(time.monotonic() - begin)
         for box in self._boxes:
             box.put(self._name if name is None else name, snapshot)
@@ -215,7 +217,7 @@ class Viewer:
         image = np.array(film.develop(), dtype=np.float32)
         names = tuple(entry.name for entry in film.bitmap().struct_())
         snapshot = Snapshot(
-            image, names, film.base_channels_count(), spp,
+            image, names, film.base_channels_count(), spp, time.monotonic() - self._begin,
             learned=statistics.learned if statistics else "",
             effects=dict(statistics.effects) if statistics else {},
         )  # fmt: skip

@@ -71,7 +71,7 @@ class WebState:
         self._pictures: dict[str, Picture] = {}
         self._facts: dict[str, str] = {}
         self._figures: dict[str, Any] = {}
-        self._number, self._begin = 0, time.monotonic()
+        self._number = 0
         # By page: when it asked last, the number that it shows, and the phase that it knows
         self._pages: dict[str, tuple[float, int, str]] = {}
 
@@ -83,7 +83,6 @@ class WebState:
         with self._lock:
             self._figures = {}
             self._pictures.clear()
-            self._begin = time.monotonic()
 
     def tell(self, figures: dict[str, Any]) -> None:
         with self._lock:
@@ -98,8 +97,10 @@ class WebState:
             picture.snapshot, picture.number = snapshot, self._number
             picture.size, picture.bad = size, bad
             if snapshot.error is not None and snapshot.error > 0:
-                seconds = self._figures.get("seconds") or time.monotonic() - self._begin
-                picture.history.append((round(seconds, 2), snapshot.spp, snapshot.error))
+                point = round(snapshot.seconds, 2), snapshot.spp, snapshot.error
+                # A comparison renders the same numbers of samples again, with other seeds
+                others = [old for old in picture.history if old[1] != snapshot.spp]
+                picture.history = sorted([*others, point], key=lambda each: each[1])
             if len(picture.history) > _MOST_POINTS:
                 del picture.history[1:-1:2]
             while len(self._pictures) > _MOST_PICTURES:
