@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
 
 
-@click.command(cls=CommandWithTev, short_help="Measure the speed and the error of integrators on scenes.")
+@click.command(
+    cls=CommandWithTev, short_help="Measure the speed and the error of integrators on scenes."
+)
 @click.option(
     "--spp", type=click.IntRange(min=1), metavar="N",
     help="Equal samples: N per pixel for each run.",
@@ -217,10 +219,12 @@ def _facts(
     scenes: Sequence[Path], integrators: Sequence[str], budget: Mapping[str, Any]
 ) -> dict[str, str]:
     """What a viewer says of the comparison."""
-    (option,) = (f"{name} {value}" for name, value in budget.items() if value is not None)
+    ((option, value),) = ((key, value) for key, value in budget.items() if value is not None)
+    if isinstance(value, Sequence):
+        value = ",".join(map(str, value))
     return {
-        "title": f"{', '.join(integrators)}", "Scene": ", ".join(map(str, scenes)),
-        "Budget": option,
+        "title": ", ".join(integrators), "Scene": ", ".join(map(str, scenes)),
+        "Budget": f"{option} {value}",
     }  # fmt: skip
 
 

@@ -144,7 +144,6 @@ class MetropolisRender(ChainRender):
             statistics.interrupted = not is_done
         finally:
             if chains.done > 0:
-                chains.end()
                 self._write(chains, image, start)
         # Not after an error, when the chains may be amid a launch
         if file:
@@ -241,6 +240,7 @@ class MetropolisRender(ChainRender):
 
     def _put(self, chains: Chains, image: ChainImage, start: Start) -> int:
         """Adds the image to the film. Returns the number of mutations."""
+        chains.end()
         mutations = chains.done * chains.count
         camera_samples = self._pixel_count * self._camera_spp
         # The mean of the samples at which the chains started, not a more precise one: only with
