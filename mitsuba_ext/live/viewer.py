@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -166,16 +167,16 @@ class Viewer:
     def close(self, phase: str = FINISHED) -> None:
         """Ends all: the last snapshots are shown, unless that takes long."""
         self.phase = phase
-        self._prepared.close(_LAST_SECONDS)
-        for box in self._boxes:
-            box.close(_LAST_SECONDS)
+        boxes = [self._prepared, *self._boxes]
+        if not all([box.close(_LAST_SECONDS) for box in boxes]):
+            self._warn("not all snapshots could be shown: the viewer did not take them")
         for receiver in self._receivers:
             receiver.close(phase)
 
     def spent(self, seconds: float) -> None:
-        """Delays the next snapshot, because the last one took ``seconds``."""
-        if not self._is_free:
-            self._due += seconds / _SHARE
+        """Delays the next snapshot, because the last one took ``seconds`` of CPU time, which the
+        render did not get."""
+        self._delay(seconds / (os.cpu_count() or 1))
 
     # ---- Pause and stop ----
 
@@ -209,7 +210,11 @@ class Viewer:
         # The first snapshot may compile kernels
         self._is_free, self._is_first = self._is_first, False
         self._due = time.monotonic() + _PERIOD
-        self.spent(seconds)
+        self._delay(seconds)
+
+    def _delay(self, seconds: float) -> None:
+        if not self._is_free:
+            self._due += seconds / _SHARE
 
     def _taken(self, film: mi.Film, spp: int, statistics: RenderStatistics | None) -> _Taken:
         import mitsuba as mi
