@@ -30,19 +30,21 @@ class Increments:
         self._mean = self._squares = np.float32(0)
 
     def add(self, contents: np.ndarray, weight_channel: int, spp: int) -> None:
-        """Adds the samples since the last call.
+        """Adds the samples since the last call, if there are any.
 
         Args:
             contents: The film's sums, [height, width, channel].
             weight_channel: The channel with the sums of filter weights.
             spp: Samples per pixel of the image.
         """
+        if self._sums is not None and spp == self._first:
+            return
         colours = min(3, weight_channel)
         now = contents[..., :colours].copy(), contents[..., weight_channel, None].copy()
         if not now[1].any():  # a light tracer leaves no weights: its film holds the mean
             now = now[0] * spp, np.full_like(now[1], spp)
         before, own = self._sums, spp - self._first
-        if before is not None and (before[0].shape != now[0].shape or own <= 0):
+        if before is not None and (before[0].shape != now[0].shape or own < 0):
             # Another film, or samples were discarded
             self.__init__()
             before, own = None, spp
