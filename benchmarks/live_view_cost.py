@@ -43,8 +43,8 @@ def cpu_seconds(integrator: str, size: str, spp: int, is_shown: bool) -> tuple[f
     count = 0
     with tempfile.TemporaryDirectory() as folder:
         process = subprocess.Popen(
-            [sys.executable, "-m", "mitsuba_ext", "render", SCENE, "-o", f"{folder}/a.exr", "--json",
-             "--integrator", integrator, "--size", size, "--spp", str(spp),
+            [sys.executable, "-m", "mitsuba_ext", "render", SCENE, "-o", f"{folder}/a.exr",
+             "--json", "--integrator", integrator, "--size", size, "--spp", str(spp),
              *(["--serve", "0"] if is_shown else [])],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip

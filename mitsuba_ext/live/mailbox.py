@@ -15,13 +15,15 @@ class Mailbox:
     Parameters:
         take: A function of a name and the newest item of this name.
         spent: A function that is called with the CPU time of each call of ``take``, in seconds.
+        failed: A function that is called with an exception of ``take``.
     """
 
     def __init__(
         self, take: Callable[[str, Any], None],
         spent: Callable[[float], None] = lambda seconds: None,
+        failed: Callable[[Exception], None] = lambda error: None,
     ) -> None:  # fmt: skip
-        self._take, self._spent = take, spent
+        self._take, self._spent, self._failed = take, spent, failed
         self._items: dict[str, Any] = {}
         self._is_working = self._is_closed = False
         self._changed = threading.Condition()
@@ -51,6 +53,8 @@ class Mailbox:
             begin = time.thread_time()
             try:
                 self._take(name, item)
+            except Exception as error:  # such as too little memory
+                self._failed(error)
             finally:
                 with self._changed:
                     self._is_working = False

@@ -94,10 +94,12 @@ class Viewer:
         self.phase, self.is_interrupted = phase, False
         self._name, self._counts_samples = "", True
         self._is_first = self._is_free = True
-        self._due, self._begin = 0.0, time.monotonic()
+        self._due, self._begin, self._is_broken = 0.0, time.monotonic(), False
         self._increments = Increments()
-        self._boxes = [Mailbox(receiver.receive, self.spent) for receiver in receivers]
-        self._prepared = Mailbox(self._hand_on, self.spent)
+        self._boxes = [
+            Mailbox(receiver.receive, self.spent, self._failed) for receiver in receivers
+        ]
+        self._prepared = Mailbox(self._hand_on, self.spent, self._failed)
 
     # ---- Snapshots ----
 
@@ -112,14 +114,14 @@ class Viewer:
         """
         self._name, self._counts_samples = name, counts_samples
         self._increments = Increments()
-        self._due, self._begin = 0.0, time.monotonic()
+        self._due, self._begin, self._is_broken = 0.0, time.monotonic(), False
         for receiver in self._receivers:
             receiver.begin()
             receiver.describe(facts)
 
     def is_due(self) -> bool:
         """Whether it is time for a snapshot."""
-        return time.monotonic() >= self._due
+        return time.monotonic() >= self._due and not self._is_broken
 
     def show(self, film: mi.Film, spp: int, statistics: RenderStatistics | None = None) -> None:
         """Takes a snapshot of a film. A render never fails because of it."""
@@ -127,8 +129,7 @@ class Viewer:
         try:
             taken = self._taken(film, spp, statistics)
         except Exception as error:  # a film may raise anything
-            self._due = float("inf")
-            self._warn(f"the unfinished image cannot be shown: {one_line(error)}")
+            self._failed(error)
             return
         self._wait_for_next(time.monotonic() - begin)
         self._prepared.put(self._name, (taken, self._increments))
@@ -141,7 +142,11 @@ class Viewer:
             name: The name of the image; ``None`` for the name that :meth:`begin` got.
         """
         begin = time.monotonic()
-        snapshot = make()
+        try:
+            snapshot = make()
+        except Exception as error:  # such as a file that is damaged
+            self._failed(error)
+            return
         if not snapshot.seconds:
             snapshot = replace(snapshot, seconds=time.monotonic() - self._begin)
         self._wait_for_next(time.monotonic() - begin)
@@ -211,6 +216,12 @@ class Viewer:
         self._is_free, self._is_first = self._is_first, False
         self._due = time.monotonic() + _PERIOD
         self._delay(seconds)
+
+    def _failed(self, error: Exception) -> None:
+        """Takes no more snapshots of this render, and says why."""
+        if not self._is_broken:
+            self._is_broken = True
+            self._warn(f"the unfinished image cannot be shown: {one_line(error)}")
 
     def _delay(self, seconds: float) -> None:
         if not self._is_free:

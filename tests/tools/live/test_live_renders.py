@@ -217,6 +217,26 @@ def test_a_film_that_cannot_be_shown_does_not_end_the_render(
     assert code == 0 and "the unfinished image cannot be shown: no such channel" in err
 
 
+@pytest.mark.parametrize("broken", ["show", "present"])
+def test_what_cannot_be_shown_is_said_once(broken):
+    said: list[str] = []
+
+    class Broken(Shown):
+        def receive(self, name, snapshot):
+            raise MemoryError("too large")
+
+    def make() -> Snapshot:
+        if broken == "present":
+            raise InputError("too large")
+        return Snapshot(np.zeros((1, 1, 3)), ("R", "G", "B"), 3, 1)
+
+    viewer = Viewer([Broken()], said.append)
+    for name in "abc":
+        viewer.present(make, name)
+    viewer.close()
+    assert said == ["the unfinished image cannot be shown: too large"]
+
+
 def test_frames_and_crop_windows_are_shown_one_after_the_other(run, make_scene, tmp_path, shown):
     code, _, _ = run(
         "render", make_scene(), "-o", tmp_path / "f.##.exr", "--frames", "1:2", "--tev",
