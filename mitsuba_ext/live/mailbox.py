@@ -14,16 +14,19 @@ class Mailbox:
 
     Parameters:
         take: A function of a name and the newest item of this name.
-        spent: A function that is called with the CPU time of each call of ``take``, in seconds.
+        spent: A function that is called with the time of each call of ``take``, in seconds.
         failed: A function that is called with an exception of ``take``.
+        clock: Measures the time; by default, the CPU time of the thread, without waiting.
     """
 
     def __init__(
         self, take: Callable[[str, Any], None],
         spent: Callable[[float], None] = lambda seconds: None,
         failed: Callable[[Exception], None] = lambda error: None,
+        clock: Callable[[], float] = time.thread_time,
     ) -> None:  # fmt: skip
         self._take, self._spent, self._failed = take, spent, failed
+        self._clock = clock
         self._items: dict[str, Any] = {}
         self._is_working = self._is_closed = False
         self._changed = threading.Condition()
@@ -50,7 +53,7 @@ class Mailbox:
                     return
                 name = next(iter(self._items))
                 item, self._is_working = self._items.pop(name), True
-            begin = time.thread_time()
+            begin = self._clock()
             try:
                 self._take(name, item)
             except Exception as error:  # such as too little memory
@@ -60,4 +63,4 @@ class Mailbox:
                     self._is_working = False
                     self._changed.notify_all()
             del item  # it may be large
-            self._spent(time.thread_time() - begin)
+            self._spent(self._clock() - begin)

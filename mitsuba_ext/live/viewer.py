@@ -99,7 +99,8 @@ class Viewer:
         self._boxes = [
             Mailbox(receiver.receive, self.spent, self._failed) for receiver in receivers
         ]
-        self._prepared = Mailbox(self._hand_on, self.spent, self._failed)
+        # On a machine with other work, this takes longer, as the render does
+        self._prepared = Mailbox(self._hand_on, self.spent, self._failed, time.perf_counter)
 
     # ---- Snapshots ----
 
