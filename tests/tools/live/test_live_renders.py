@@ -193,7 +193,7 @@ def test_stop_acts_as_ctrl_c_and_pause_holds_the_render(
     def told(viewer: Viewer, **figures) -> None:
         if figures.get("spp") == 12:
             viewer.pause()
-            threading.Timer(0.1, lambda: (phases.append(viewer.phase), viewer.stop())).start()
+            threading.Timer(0.5, lambda: (phases.append(viewer.phase), viewer.stop())).start()
         tell(viewer, **figures)
 
     monkeypatch.setattr(Viewer, "tell", told)
@@ -203,6 +203,7 @@ def test_stop_acts_as_ctrl_c_and_pause_holds_the_render(
     assert (code, phases) == (130, ["paused"])
     spp = int(re.search(r"interrupted after (\d+) of 4000 spp", err)[1])
     assert read_exr(output)[1]["spp"] == spp == shown.snapshots[-1].spp
+    assert 12 <= spp < 100, "it went on while it was paused"
     assert shown.phase == "interrupted"
 
 
