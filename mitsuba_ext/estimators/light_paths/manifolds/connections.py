@@ -1,0 +1,242 @@
+"""Connections of camera vertices to lights through smooth glass and mirrors.
+
+Source: T. Zeltner, I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering High-Frequency
+Caustics and Glints*, SIGGRAPH 2020.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ....scene.bsdfs import _index
+from ....transport.bsdfs import eval_bsdf
+from ....transport.heroes import Heroes
+from ....transport.mis import power_heuristic
+from ....transport.numbers import hashed_2d
+from ....transport.path_decisions import SceneQuery
+from ....transport.path_program import PathProgram, Subpaths
+from ....util.arrays import from_numpy
+from ..emission import LightEmission
+from .casters import caster_shapes
+from .chain import Chains, is_caster
+from .solver import Solver, Target, missed
+
+SAME = 1e-6
+MOST_TRIALS = 2000
+#: The number of surfaces behind the last diffuse vertex, where no connection finds the path.
+NEVER = 255
+
+
+class ManifoldConnections(Subpaths):
+    def __init__(self, scene, query: SceneQuery, max_depth: int, most: int) -> None:
+        self._scene, self._query = scene, query
+        self._heroes = Heroes(scene)
+        self._ctx = self._heroes.context()
+        shapes = caster_shapes(scene)
+        self.bsdfs = list({id(s.bsdf()): s.bsdf() for s in shapes}.values())
+        indices = [_index(b) for b in self.bsdfs]
+        table = np.zeros(max(indices) + 1, bool)
+        table[indices] = True
+        self.table = mi.Bool(table)
+        every = mi.ShapePtr
+        self._shapes = dr.gather(
+            mi.ShapePtr, scene.shapes_dr(),
+            mi.UInt32([i for i, s in enumerate(scene.shapes()) if any(s is x for x in shapes)]),
+        )
+        self._count = len(shapes)
+        self._emission = LightEmission(scene)
+        self._max_depth, self.most = dr.opaque(mi.UInt32, max_depth), most
+        self._refracts = any(
+            int(b.flags()) & int(mi.BSDFFlags.DeltaTransmission) for b in self.bsdfs
+        )
+        self._chains = Chains(scene, query, shapes, self.table, self._ctx)
+        self._solver = Solver(self._chains, query.starts)
+
+    @dr.syntax
+    def gather(self, scene, sampler, vertex, active):
+        si = vertex.si
+        seed = mi.UInt32(sampler.next_1d() * 4294967040.0)
+        # ---- A point on a light ----
+        room = self._max_depth - dr.minimum(vertex.depth + 2, self._max_depth)
+        most = dr.minimum(room, self.most)
+        active = mi.Bool(active) & (most > 0)
+        light = self._emission.sample(
+            _Hashed(seed, mi.UInt32(0xFFFF0000)), si.time, si.wavelengths, active
+        )
+        target = Target(
+            dr.select(light.is_infinite, mi.Point3f(-light.ray.d), light.start.p), light.is_infinite
+        )
+        # ---- Trials: the first that finds a chain, then those that tell how likely that was ----
+        found, going = mi.Bool(False), mi.Bool(active)
+        d, out, o, p = mi.Vector3f(0), mi.Vector3f(0), mi.Point3f(0), mi.Point3f(0)
+        weight, density, chance = mi.Spectrum(0), mi.Float(0), mi.Float(0)
+        index, which = mi.UInt32(0), mi.UInt32(0)
+        while dr.hint(going, label="trials"):
+            transmits, is_open, first_d = self._seed(seed, index, si, target)
+            most_here = dr.select(transmits != 0, most, 1)
+            length = dr.select(is_open, most_here, 1)
+            solution = self._solver.solve(
+                si, first_d, length, transmits, is_open, target, going
+            )
+            pattern = solution.end.length * 4 + (transmits & 1)
+            is_first = index == 0
+            fresh = going & is_first & solution.is_found
+            same = going & ~is_first & solution.is_found & (
+                dr.squared_norm(solution.d - d) < SAME
+            ) & (which == pattern)
+            which = dr.select(fresh, pattern, which)
+            d = dr.select(fresh, solution.d, d)
+            out = dr.select(fresh, solution.end.d, out)
+            o = dr.select(fresh, solution.end.o, o)
+            p = dr.select(fresh, solution.end.p, p)
+            weight = dr.select(fresh, solution.end.weight, weight)
+            density = dr.select(fresh, solution.density, density)
+            chance = dr.select(fresh, solution.end.chance, chance)
+            found |= fresh
+            going &= found & ~same & (index < MOST_TRIALS)
+            index += 1
+        count = mi.Float(index - 1)
+        # ---- Its light ----
+        wo = si.to_local(d)
+        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, found)
+        start = light.start
+        start.wi = start.to_local(-out)
+        is_surface = ~light.is_infinite & ~light.is_delta_position
+        emitted = light.emitter.eval(start, found & is_surface)
+        cosine = dr.abs(dr.dot(self._emission.front(start), out))
+        emitted *= cosine / (light.probability * light.pdf_position)
+        # Radiance / density
+        sky = light.weight * light.pdf_position
+        ref = dr.zeros(mi.Interaction3f)
+        ref.p = p
+        ds, intensity = light.emitter.sample_direction(ref, mi.Point2f(0.5), found & light.is_delta_position)
+        intensity = intensity * dr.square(ds.dist) / light.probability
+        emitted = dr.select(light.is_infinite, sky, dr.select(light.is_delta_position, intensity, emitted))
+        # ---- MIS with paths that the BSDFs sample ----
+        to_area = dr.select(is_surface, cosine, 1)
+        by_bsdf = pdf * chance * density * to_area
+        by_us = light.probability * dr.select(
+            light.is_infinite, light.pdf_direction, light.pdf_position
+        )
+        is_delta = light.is_delta_position | light.is_delta_direction
+        mis = dr.select(is_delta, 1, power_heuristic(by_us, by_bsdf))
+        L = vertex.path.β * value * weight * emitted * (density * count * mis)
+        tested = found & (dr.max(dr.abs(L)) > 0)
+        distance = dr.norm(target.p - o)
+        ray = mi.Ray3f(
+            o, dr.select(target.is_infinite, mi.Vector3f(target.p), (target.p - o) / distance),
+        )
+        ray.maxt = dr.select(target.is_infinite, dr.largest(mi.Float), distance * (1 - mi.math.ShadowEpsilon))
+        visible = tested & ~self._scene.ray_test(ray, active=tested)
+        return dr.select(visible, L, 0), dr.select(tested, mi.UInt32(1), 0)
+
+    def _seed(self, seed, index, si, target):
+        base = index * 4
+        a, b, c = (hashed_2d(seed, base + i) for i in range(3))
+        which = dr.minimum(mi.UInt32(a.x * self._count), self._count - 1)
+        shape = dr.gather(mi.ShapePtr, self._shapes, which)
+        ps = shape.sample_position(si.time, b)
+        d = dr.normalize(ps.p - si.p)
+        transmits, is_open = mi.UInt32(0), mi.Bool(False)
+        if self._refracts:
+            straight = dr.select(target.is_infinite, mi.Vector3f(target.p), dr.normalize(target.p - si.p))
+            transmits = dr.select(c.x < 0.25, mi.UInt32(0), 3)
+            is_open = (transmits != 0) & (a.y < 0.9)
+            d = dr.select((transmits != 0) & (c.y < 0.5), straight, d)
+        return transmits, is_open, d
+
+    @dr.syntax
+    def by_bsdf(self, history, si, ds, active):
+        """The MIS weight of light that a path has hit through a chain."""
+        chain = self._chains.trace(
+            mi.Ray3f(history.o, history.d), history.length, history.transmits, mi.Bool(False), active
+        )
+        is_infinite = ~si.is_valid()
+        target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
+        miss = missed(chain, target)
+        n = dr.select(is_infinite, mi.Normal3f(-ds.d), self._emission.front(si))
+        position, direction = self._emission.densities(
+            self._scene, ds.emitter, -chain.d, n, self._centre(si), active, True
+        )
+        cosine = dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
+        by_us = dr.select(is_infinite, direction * self._emission.chance(self._emission.index(ds.emitter, active), active), position)
+        sound = active & miss.is_sound
+        by_bsdf = history.pdf * chain.chance * miss.density * cosine
+        return dr.select(sound, power_heuristic(by_bsdf, by_us), 1)
+
+    def _centre(self, si):
+        ref = dr.zeros(mi.Interaction3f)
+        ref.p = si.p
+        return ref
+
+
+@dataclass
+class History:
+    """The casters that a path has met since the last vertex that was connected.
+
+    Attributes:
+        o, d, pdf: Origin and direction of the ray that left the vertex, and its density.
+        length: The number of casters; NEVER where no connection finds the path.
+        transmits: Bit i tells whether caster i has transmitted the ray.
+    """
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    pdf: mi.Float
+    length: mi.UInt32
+    transmits: mi.UInt32
+
+
+class _Hashed:
+    def __init__(self, seed, index) -> None:
+        self.seed, self.index = seed, index
+
+    def next_2d(self, active=True):
+        self.index = self.index + 1
+        return hashed_2d(self.seed, self.index)
+
+    def next_1d(self, active=True):
+        return self.next_2d().x
+
+
+class ManifoldProgram(PathProgram):
+    """Camera paths whose vertices are connected to lights through chains of casters. Paths that
+    such a connection can find are left to it.
+
+    The history is the number of casters since the last vertex that was connected.
+    """
+
+    def __init__(self, subpaths: ManifoldConnections) -> None:
+        self.subpaths = subpaths
+
+    def begin(self, ray):
+        return History(
+            mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(0), mi.UInt32(NEVER), mi.UInt32(0)
+        )
+
+    def leave(self, vertex, bs):
+        h, most = vertex.path.history, self.subpaths.most
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        passes = is_caster(self.subpaths.table, vertex.bsdf) & (h.length < most)
+        # Only chains of refractions have more than one surface
+        passes &= (h.length == 0) | (transmitted & (h.transmits != 0))
+        si = vertex.si
+        ray = self.subpaths._query.starts.along(si, si.to_world(bs.wo))
+        bit = dr.select(transmitted, mi.UInt32(1) << h.length, 0)
+        return History(
+            dr.select(is_delta, h.o, ray.o), dr.select(is_delta, h.d, ray.d),
+            dr.select(is_delta, h.pdf, bs.pdf),
+            dr.select(is_delta, dr.select(passes, h.length + 1, NEVER), 0),
+            dr.select(is_delta, h.transmits | bit, 0),
+        )
+
+    def emission(self, weights, scene, si, ds, path, pdf):
+        h = path.history
+        own = (h.length != NEVER) & (h.length > 0) & (ds.emitter != None)
+        mis = self.subpaths.by_bsdf(h, si, ds, own)
+        return dr.select(own, mis, weights.emission(path.arrival.pdf, pdf))
