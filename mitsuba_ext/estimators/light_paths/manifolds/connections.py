@@ -25,8 +25,6 @@ from .casters import caster_shapes
 from .chain import Chains, is_caster
 from .solver import Solver, Target, missed
 
-SAME = 1e-6
-MOST_TRIALS = 2000
 #: The number of surfaces behind the last diffuse vertex, where no connection finds the path.
 NEVER = 255
 
@@ -54,7 +52,7 @@ class ManifoldConnections(Subpaths):
             int(b.flags()) & int(mi.BSDFFlags.DeltaTransmission) for b in self.bsdfs
         )
         self._chains = Chains(scene, query, shapes, self.table, self._ctx)
-        self._solver = Solver(self._chains, query.starts)
+        self._solver = Solver(self._chains, query.starts, self._seed)
 
     @dr.syntax
     def gather(self, scene, sampler, vertex, active):
@@ -70,36 +68,10 @@ class ManifoldConnections(Subpaths):
         target = Target(
             dr.select(light.is_infinite, mi.Point3f(-light.ray.d), light.start.p), light.is_infinite
         )
-        # ---- Trials: the first that finds a chain, then those that tell how likely that was ----
-        found, going = mi.Bool(False), mi.Bool(active)
-        d, out, o, p = mi.Vector3f(0), mi.Vector3f(0), mi.Point3f(0), mi.Point3f(0)
-        weight, density, chance = mi.Spectrum(0), mi.Float(0), mi.Float(0)
-        index, which = mi.UInt32(0), mi.UInt32(0)
-        while dr.hint(going, label="trials"):
-            transmits, is_open, first_d = self._seed(seed, index, si, target)
-            most_here = dr.select(transmits != 0, most, 1)
-            length = dr.select(is_open, most_here, 1)
-            solution = self._solver.solve(
-                si, first_d, length, transmits, is_open, target, going
-            )
-            pattern = solution.end.length * 4 + (transmits & 1)
-            is_first = index == 0
-            fresh = going & is_first & solution.is_found
-            same = going & ~is_first & solution.is_found & (
-                dr.squared_norm(solution.d - d) < SAME
-            ) & (which == pattern)
-            which = dr.select(fresh, pattern, which)
-            d = dr.select(fresh, solution.d, d)
-            out = dr.select(fresh, solution.end.d, out)
-            o = dr.select(fresh, solution.end.o, o)
-            p = dr.select(fresh, solution.end.p, p)
-            weight = dr.select(fresh, solution.end.weight, weight)
-            density = dr.select(fresh, solution.density, density)
-            chance = dr.select(fresh, solution.end.chance, chance)
-            found |= fresh
-            going &= found & ~same & (index < MOST_TRIALS)
-            index += 1
-        count = mi.Float(index - 1)
+        solution = self._solver.find(si, target, seed, most, active)
+        found, d, out, o = solution.is_found, solution.d, solution.end.d, solution.end.o
+        p, weight, density = solution.end.p, solution.end.weight, solution.density
+        chance, count = solution.end.chance, solution.count
         # ---- Its light ----
         wo = si.to_local(d)
         value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, found)

@@ -13,6 +13,8 @@ MAX_STEPS = 20
 TOLERANCE = 1e-4
 LEAST_TURN = 1e-3
 LEAST_STEP = 1 / 64
+SAME = 1e-6
+MOST_TRIALS = 2000
 
 
 @dataclass
@@ -70,61 +72,89 @@ def missed(end: RayState, target: Target) -> Miss:
 
 @dataclass
 class Solution:
-    """A chain that ends at its target."""
+    """A chain that ends at its target.
+
+    Attributes:
+        d: The first direction.
+        end: The end of the chain.
+        density: See :class:`Miss`.
+        pattern: Length and kind of the chain.
+        count: The number of further trials until one found the same chain: an estimate of 1 / the
+            probability of finding it.
+        is_found: Whether there is one.
+    """
 
     d: mi.Vector3f
     end: RayState
     density: mi.Float
+    pattern: mi.UInt32
+    count: mi.Float
     is_found: mi.Bool
 
 
 class Solver:
-    """Newton's method."""
+    """Finds a chain from a random seed by Newton's method, and estimates how likely that was."""
 
-    def __init__(self, chains: Chains, starts) -> None:
-        self._chains, self._starts = chains, starts
+    def __init__(self, chains: Chains, starts, seeds) -> None:
+        self._chains, self._starts, self._seeds = chains, starts, seeds
 
     @dr.syntax
-    def solve(self, si, d, length, transmits, is_open, target: Target, active) -> Solution:
-        """Newton's method over the first direction, from ``d``."""
-        best_d, best_error = mi.Vector3f(d), mi.Float(dr.inf)
-        step_s, step_t, share = mi.Float(0), mi.Float(0), mi.Float(1)
-        density, found = mi.Float(0), mi.Bool(False)
-        p, out, o = mi.Point3f(0), mi.Vector3f(0), mi.Point3f(0)
-        weight, chance = mi.Spectrum(0), mi.Float(0)
-        steps = mi.UInt32(0)
-        length = mi.UInt32(length)
+    def find(self, si, target: Target, seed: mi.UInt32, most: mi.UInt32, active) -> Solution:
+        """The chain that the first trial finds. Further trials follow until one finds it again."""
+        best_d, best_error = mi.Vector3f(0), mi.Float(dr.inf)
+        step, share = mi.Vector2f(0), mi.Float(1)
+        transmits, length = mi.UInt32(0), mi.UInt32(0)
+        zero = mi.Vector3f(0)
+        found = Solution(
+            mi.Vector3f(0),
+            RayState(mi.Point3f(0), zero, mi.Point3f(0), zero, zero, zero, zero, mi.Spectrum(0),
+                     mi.Float(0), mi.UInt32(0), mi.Bool(False)),
+            mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Bool(False),
+        )
+        steps, trial = mi.UInt32(0), mi.UInt32(0)
         going = mi.Bool(active)
         while dr.hint(going, label="manifold walk"):
+            # ---- A new trial, or the next step ----
+            begins = steps == 0
+            chosen, is_open, seed_d = self._seeds(seed, trial, si, target)
+            transmits = dr.select(begins, chosen, transmits)
+            is_open &= begins
+            longest = dr.select(is_open, most, 1)
+            length = dr.select(begins, longest, length)
             frame = mi.Frame3f(best_d)
-            new = dr.normalize(
-                best_d + share * (step_s * frame.s + step_t * frame.t)
-            )
-            end = self._chains.trace(
-                self._starts.along(si, new), length, transmits, is_open & (steps == 0), going
-            )
-            length = dr.select(going & (steps == 0), end.length, length)
+            d = dr.normalize(best_d + share * (step.x * frame.s + step.y * frame.t))
+            d = dr.select(begins, seed_d, d)
+            best_error = dr.select(begins, dr.inf, best_error)
+            share = dr.select(begins, 1, share)
+            end = self._chains.trace(self._starts.along(si, d), length, transmits, is_open, going)
+            length = dr.select(begins, end.length, length)
             miss = missed(end, target)
+            # ---- Is it better? ----
             better = going & miss.is_sound & (miss.error < best_error)
-            turn = dr.sqrt(dr.square(miss.step_s) + dr.square(miss.step_t))
-            done = better & (miss.error < TOLERANCE) & (turn < LEAST_TURN)
             best_error = dr.select(better, miss.error, best_error)
-            best_d = dr.select(better, new, best_d)
-            step_s = dr.select(better, miss.step_s, step_s)
-            step_t = dr.select(better, miss.step_t, step_t)
+            best_d = dr.select(better, d, best_d)
+            step = dr.select(better, mi.Vector2f(miss.step_s, miss.step_t), step)
+            turn = dr.norm(step)
+            done = better & (miss.error < TOLERANCE) & (turn < LEAST_TURN)
             share = dr.select(better, dr.minimum(1, 2 * share), 0.5 * share)
             # A step of more than a radian leaves what the derivatives describe
-            length_of_step = dr.sqrt(dr.square(step_s) + dr.square(step_t))
-            share = dr.minimum(share, dr.rcp(length_of_step))
-            found |= done
-            density = dr.select(done, miss.density, density)
-            p, out = dr.select(done, end.p, p), dr.select(done, end.d, out)
-            o = dr.select(done, end.o, o)
-            weight = dr.select(done, end.weight, weight)
-            chance = dr.select(done, end.chance, chance)
+            share = dr.minimum(share, dr.rcp(turn))
             steps += 1
-            going &= ~done & (steps < MAX_STEPS) & (share > LEAST_STEP)
-            going &= dr.isfinite(best_error)
-        zero = mi.Vector3f(0)
-        end = RayState(p, out, o, zero, zero, zero, zero, weight, chance, length, found)
-        return Solution(best_d, end, density, found)
+            fails = ~done & (
+                (steps >= MAX_STEPS) | (share < LEAST_STEP) | ~dr.isfinite(best_error)
+            )
+            # ---- The first trial, or one of those that follow ----
+            pattern = end.length * 4 + (transmits & 1)
+            fresh = done & (trial == 0)
+            same = done & (trial > 0) & (pattern == found.pattern) & (
+                dr.squared_norm(d - found.d) < SAME
+            )
+            new = Solution(d, end, miss.density, pattern, found.count, mi.Bool(True))
+            found = dr.select(fresh, new, found)
+            found.count = dr.select(same, mi.Float(trial), found.count)
+            ends = done | fails
+            trial += dr.select(ends, 1, 0)
+            steps = dr.select(ends, 0, steps)
+            going &= ~ends | (found.is_found & ~same & (trial < MOST_TRIALS))
+        found.count = dr.select(found.count == 0, mi.Float(trial), found.count)
+        return found
