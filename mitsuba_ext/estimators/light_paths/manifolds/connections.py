@@ -6,7 +6,8 @@ Caustics and Glints*, SIGGRAPH 2020.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,11 +23,13 @@ from ....transport.path_program import PathProgram, Subpaths
 from ....util.arrays import from_numpy
 from ..emission import LightEmission
 from .casters import caster_shapes
+from ..stored_interaction import as_float, from_words, needs_whole_interaction, to_words
 from .chain import Chains, is_caster
-from .solver import Solver, Target, missed
+from .solver import Solver, Target, Tasks, missed
 
 #: The number of surfaces behind the last diffuse vertex, where no connection finds the path.
 NEVER = 255
+WORDS = 40
 
 
 class ManifoldConnections(Subpaths):
@@ -52,29 +55,74 @@ class ManifoldConnections(Subpaths):
             int(b.flags()) & int(mi.BSDFFlags.DeltaTransmission) for b in self.bsdfs
         )
         self._chains = Chains(scene, query, shapes, self.table, self._ctx)
+        self._is_whole = needs_whole_interaction(scene)
         self._solver = Solver(self._chains, query.starts, self._seed)
 
-    @dr.syntax
+    def begin(self, lanes: int) -> None:
+        self.lanes = lanes
+        self._words = dr.empty(mi.Float, lanes * WORDS)
+        self._totals = dr.zeros(mi.Float, lanes)
+
     def gather(self, scene, sampler, vertex, active):
-        si = vertex.si
-        seed = mi.UInt32(sampler.next_1d() * 4294967040.0)
-        # ---- A point on a light ----
-        room = self._max_depth - dr.minimum(vertex.depth + 2, self._max_depth)
-        most = dr.minimum(room, self.most)
-        active = mi.Bool(active) & (most > 0)
+        number = sampler.next_1d()
+        seed = mi.UInt32(number * 4294967040.0)
+        h = vertex.path.history
+        w = self.importance(vertex, active)
+        total = h.total + w
+        u = hashed_2d(seed, mi.UInt32(0xFFFFFFFF)).x
+        taken = active & (w > 0) & (u * total <= w)
+        words = [*vertex.path.β, w, as_float(seed), as_float(vertex.depth)]
+        words += to_words(vertex.si, self._is_whole)
+        words += [mi.Float(0)] * (WORDS - len(words))
+        dr.scatter(self._words, mi.ArrayXf(words), h.lane, taken)
+        dr.scatter(self._totals, total, h.lane, active & (w > 0))
+        return mi.Spectrum(0), mi.UInt32(0)
+
+    def importance(self, vertex, active):
+        most = self._most_at(vertex.depth)
+        eligible = mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth) & (most > 0)
+        return dr.select(eligible, dr.max(vertex.path.β), 0)
+
+    def _most_at(self, depth):
+        room = self._max_depth - dr.minimum(depth + 2, self._max_depth)
+        return dr.minimum(room, self.most)
+
+    @dr.syntax
+    def connect(self, rays):
+        """The light of one chain for each path."""
+        count = self.lanes
+        index = dr.arange(mi.UInt32, count)
+        total = dr.gather(mi.Float, self._totals, index)
+        active = total > 0
+        w = dr.gather(mi.ArrayXf, self._words, index, active, shape=(WORDS, count))
+        β = mi.Spectrum(*(w[i] for i in range(3))) * dr.select(active, total / w[3], 0)
+        seed, depth = dr.reinterpret_array(mi.UInt32, w[4]), dr.reinterpret_array(mi.UInt32, w[5])
+        si = from_words([w[i] for i in range(6, WORDS)], self._is_whole)
+        si.time, si.wavelengths = rays.ray.time, rays.ray.wavelengths
         light = self._emission.sample(
             _Hashed(seed, mi.UInt32(0xFFFF0000)), si.time, si.wavelengths, active
         )
         target = Target(
             dr.select(light.is_infinite, mi.Point3f(-light.ray.d), light.start.p), light.is_infinite
         )
-        solution = self._solver.find(si, target, seed, most, active)
-        found, d, out, o = solution.is_found, solution.d, solution.end.d, solution.end.o
-        p, weight, density = solution.end.p, solution.end.weight, solution.density
-        chance, count = solution.end.chance, solution.count
+        most = dr.select(active, self._most_at(depth), 0)
+        tasks = Tasks(si, target, seed, most)
+        dr.eval(tasks.words)
+        solution = self._solver.find(tasks)
+        dr.eval(solution)
+        found = active & (solution.pattern != 0)
+        transmits = dr.select((solution.pattern & 1) != 0, mi.UInt32(3), 0)
+        d, count = solution.d, mi.Float(solution.count)
+        end = self._chains.trace(
+            self._query.starts.along(si, d), solution.pattern >> 2, transmits, mi.Bool(False), found
+        )
+        miss = missed(end, target)
+        found &= miss.is_sound
+        out, o, p, weight = end.d, end.o, end.p, end.weight
+        density, chance = miss.density, end.chance
         # ---- Its light ----
         wo = si.to_local(d)
-        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, found)
+        value, pdf = eval_bsdf(si.bsdf(), self._ctx, si, wo, found)
         start = light.start
         start.wi = start.to_local(-out)
         is_surface = ~light.is_infinite & ~light.is_delta_position
@@ -96,7 +144,7 @@ class ManifoldConnections(Subpaths):
         )
         is_delta = light.is_delta_position | light.is_delta_direction
         mis = dr.select(is_delta, 1, power_heuristic(by_us, by_bsdf))
-        L = vertex.path.β * value * weight * emitted * (density * count * mis)
+        L = β * value * weight * emitted * (density * count * mis)
         tested = found & (dr.max(dr.abs(L)) > 0)
         distance = dr.norm(target.p - o)
         ray = mi.Ray3f(
@@ -161,6 +209,8 @@ class History:
     pdf: mi.Float
     length: mi.UInt32
     transmits: mi.UInt32
+    lane: mi.UInt32
+    total: mi.Float
 
 
 class _Hashed:
@@ -187,7 +237,8 @@ class ManifoldProgram(PathProgram):
 
     def begin(self, ray):
         return History(
-            mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(0), mi.UInt32(NEVER), mi.UInt32(0)
+            mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(0), mi.UInt32(NEVER), mi.UInt32(0),
+            dr.arange(mi.UInt32, self.subpaths.lanes), mi.Float(0),
         )
 
     def leave(self, vertex, bs):
@@ -204,7 +255,8 @@ class ManifoldProgram(PathProgram):
             dr.select(is_delta, h.o, ray.o), dr.select(is_delta, h.d, ray.d),
             dr.select(is_delta, h.pdf, bs.pdf),
             dr.select(is_delta, dr.select(passes, h.length + 1, NEVER), 0),
-            dr.select(is_delta, h.transmits | bit, 0),
+            dr.select(is_delta, h.transmits | bit, 0), h.lane,
+            h.total + self.subpaths.importance(vertex, True),
         )
 
     def emission(self, weights, scene, si, ds, path, pdf):
@@ -212,3 +264,21 @@ class ManifoldProgram(PathProgram):
         own = (h.length != NEVER) & (h.length > 0) & (ds.emitter != None)
         mis = self.subpaths.by_bsdf(h, si, ds, own)
         return dr.select(own, mis, weights.emission(path.arrival.pdf, pdf))
+
+
+@dataclass
+class ManifoldTracer:
+    """A walk, and one chain for each of its paths."""
+
+    walk: Any
+    make: Any
+
+    def __call__(self, scene, sampler, rays, active):
+        subpaths = self.make()
+        subpaths.begin(dr.width(rays.ray))
+        walk = replace(self.walk, program=ManifoldProgram(subpaths))
+        dr.schedule(rays)
+        sample = walk(scene, sampler, rays, active)
+        dr.eval(sample, subpaths._words, subpaths._totals)
+        L, tested = subpaths.connect(rays)
+        return replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..stored_interaction import as_float
 from .chain import Chains, RayState
 
 MAX_STEPS = 20
@@ -14,6 +15,7 @@ TOLERANCE = 1e-4
 LEAST_TURN = 1e-3
 LEAST_STEP = 1 / 64
 SAME = 1e-6
+TASKS_PER_LANE = 16
 MOST_TRIALS = 2000
 
 
@@ -70,50 +72,79 @@ def missed(end: RayState, target: Target) -> Miss:
     )
 
 
+# Not a dataclass: loops only read it
+class Tasks:
+    """What is searched for: one chain for each lane of a pass, or none.
+
+    Attributes:
+        words: For each: the vertex (position and normal), the target, the seed of its random
+            numbers, and the longest chain (0 where nothing is searched; a bit for lights at
+            infinity).
+        count: Number of lanes.
+    """
+
+    WORDS = 16
+
+    def __init__(self, si, target: Target, seed, most) -> None:
+        self.count = dr.width(seed)
+        mark = most | dr.select(target.is_infinite, mi.UInt32(256), 0)
+        words = [*si.p, *si.n, *target.p, as_float(seed), as_float(mark)]
+        words += [mi.Float(0)] * (self.WORDS - len(words))
+        self.words = dr.empty(mi.Float, self.count * self.WORDS)
+        dr.scatter(self.words, mi.ArrayXf(words), dr.arange(mi.UInt32, self.count))
+
+    def at(self, index, active):
+        w = dr.gather(mi.ArrayXf, self.words, index, active, shape=(self.WORDS, dr.width(index)))
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+        si.p, si.n = mi.Point3f(w[0], w[1], w[2]), mi.Normal3f(w[3], w[4], w[5])
+        mark = dr.reinterpret_array(mi.UInt32, w[10])
+        target = Target(mi.Point3f(w[6], w[7], w[8]), (mark & 256) != 0)
+        return si, target, dr.reinterpret_array(mi.UInt32, w[9]), mark & 255
+
+
 @dataclass
-class Solution:
-    """A chain that ends at its target.
+class Found:
+    """The chains that were found, one for each lane.
 
     Attributes:
         d: The first direction.
-        end: The end of the chain.
-        density: See :class:`Miss`.
-        pattern: Length and kind of the chain.
+        pattern: Length and kind of the chain; 0 if none was found.
         count: The number of further trials until one found the same chain: an estimate of 1 / the
             probability of finding it.
-        is_found: Whether there is one.
     """
 
     d: mi.Vector3f
-    end: RayState
-    density: mi.Float
     pattern: mi.UInt32
-    count: mi.Float
-    is_found: mi.Bool
+    count: mi.UInt32
 
 
 class Solver:
-    """Finds a chain from a random seed by Newton's method, and estimates how likely that was."""
+    """Finds chains from random seeds by Newton's method, and estimates how likely that was."""
 
     def __init__(self, chains: Chains, starts, seeds) -> None:
         self._chains, self._starts, self._seeds = chains, starts, seeds
 
     @dr.syntax
-    def find(self, si, target: Target, seed: mi.UInt32, most: mi.UInt32, active) -> Solution:
-        """The chain that the first trial finds. Further trials follow until one finds it again."""
+    def find(self, tasks: Tasks) -> Found:
+        """The chains that first trials find. Further trials follow until one finds it again.
+
+        A lane takes one task after the other: Dr.Jit works on 8 to 32 lanes at once, and all wait
+        for the slowest. Sums of many tasks differ less than single ones."""
+        lanes = -(-tasks.count // TASKS_PER_LANE)
+        result_d = dr.zeros(mi.Float, 3 * tasks.count)
+        result_pattern = dr.zeros(mi.UInt32, tasks.count)
+        result_count = dr.zeros(mi.UInt32, tasks.count)
+        task, count = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, tasks.count)
+        stride = dr.opaque(mi.UInt32, lanes)
         best_d, best_error = mi.Vector3f(0), mi.Float(dr.inf)
         step, share = mi.Vector2f(0), mi.Float(1)
         transmits, length = mi.UInt32(0), mi.UInt32(0)
-        zero = mi.Vector3f(0)
-        found = Solution(
-            mi.Vector3f(0),
-            RayState(mi.Point3f(0), zero, mi.Point3f(0), zero, zero, zero, zero, mi.Spectrum(0),
-                     mi.Float(0), mi.UInt32(0), mi.Bool(False)),
-            mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Bool(False),
-        )
+        found_d, found_pattern = mi.Vector3f(0), mi.UInt32(0)
         steps, trial = mi.UInt32(0), mi.UInt32(0)
-        going = mi.Bool(active)
+        going = task < count
         while dr.hint(going, label="manifold walk"):
+            si, target, seed, most = tasks.at(task, going)
+            tried = going & (most > 0)
             # ---- A new trial, or the next step ----
             begins = steps == 0
             chosen, is_open, seed_d = self._seeds(seed, trial, si, target)
@@ -126,11 +157,11 @@ class Solver:
             d = dr.select(begins, seed_d, d)
             best_error = dr.select(begins, dr.inf, best_error)
             share = dr.select(begins, 1, share)
-            end = self._chains.trace(self._starts.along(si, d), length, transmits, is_open, going)
+            end = self._chains.trace(self._starts.along(si, d), length, transmits, is_open, tried)
             length = dr.select(begins, end.length, length)
             miss = missed(end, target)
             # ---- Is it better? ----
-            better = going & miss.is_sound & (miss.error < best_error)
+            better = tried & miss.is_sound & (miss.error < best_error)
             best_error = dr.select(better, miss.error, best_error)
             best_d = dr.select(better, d, best_d)
             step = dr.select(better, mi.Vector2f(miss.step_s, miss.step_t), step)
@@ -140,21 +171,29 @@ class Solver:
             # A step of more than a radian leaves what the derivatives describe
             share = dr.minimum(share, dr.rcp(turn))
             steps += 1
-            fails = ~done & (
-                (steps >= MAX_STEPS) | (share < LEAST_STEP) | ~dr.isfinite(best_error)
-            )
+            ends = done | ~tried | (steps >= MAX_STEPS) | (share < LEAST_STEP) | ~dr.isfinite(best_error)
             # ---- The first trial, or one of those that follow ----
             pattern = end.length * 4 + (transmits & 1)
             fresh = done & (trial == 0)
-            same = done & (trial > 0) & (pattern == found.pattern) & (
-                dr.squared_norm(d - found.d) < SAME
+            found_d = dr.select(fresh, d, found_d)
+            found_pattern = dr.select(fresh, pattern, found_pattern)
+            same = done & (trial > 0) & (pattern == found_pattern) & (
+                dr.squared_norm(d - found_d) < SAME
             )
-            new = Solution(d, end, miss.density, pattern, found.count, mi.Bool(True))
-            found = dr.select(fresh, new, found)
-            found.count = dr.select(same, mi.Float(trial), found.count)
-            ends = done | fails
+            finishes = ends & ((found_pattern == 0) | same | (trial >= MOST_TRIALS))
+            record = going & finishes & (found_pattern != 0)
+            dr.scatter(result_d, found_d.x, task, record)
+            dr.scatter(result_d, found_d.y, task + count, record)
+            dr.scatter(result_d, found_d.z, task + 2 * count, record)
+            dr.scatter(result_pattern, found_pattern, task, record)
+            dr.scatter(result_count, trial, task, record)
+            # ---- The next trial, or the next task ----
             trial += dr.select(ends, 1, 0)
             steps = dr.select(ends, 0, steps)
-            going &= ~ends | (found.is_found & ~same & (trial < MOST_TRIALS))
-        found.count = dr.select(found.count == 0, mi.Float(trial), found.count)
-        return found
+            trial = dr.select(finishes, 0, trial)
+            found_pattern = dr.select(finishes, 0, found_pattern)
+            task += dr.select(finishes, stride, 0)
+            going = task < count
+        index = dr.arange(mi.UInt32, tasks.count)
+        d = mi.Vector3f(*(dr.gather(mi.Float, result_d, index + i * count) for i in range(3)))
+        return Found(d, result_pattern, result_count)
