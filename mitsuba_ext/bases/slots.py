@@ -8,6 +8,7 @@ from functools import partial
 import mitsuba as mi
 
 from ..estimators.light_paths.choice import light_paths
+from ..estimators.light_paths.manifolds import parameters as manifolds
 from ..estimators.light_paths.subpath_choice import parameters as subpath_choice
 from ..planning.technique import ParameterReader, Technique
 from ..techniques.guided_directions import parameters as guided_directions
@@ -36,6 +37,7 @@ _TECHNIQUES: tuple[type[Technique], ...] = (
     *weighted_points.TECHNIQUES,
     *mis.TECHNIQUES,
     *shadow_rejection.TECHNIQUES,
+    *manifolds.TECHNIQUES,
     *subpath_choice.TECHNIQUES,
     *light_paths.TECHNIQUES,
 )
@@ -45,8 +47,8 @@ _TECHNIQUES: tuple[type[Technique], ...] = (
 _PATH_WORDS = {
     "directions": "uniform", "scattering": "bsdf", "next_event": "uniform",
     "light_numbers": "uniform", "roulette": "throughput", "connections": "one", "mis": "power",
-    "shadow_test": "always", "aperture": "sampler", "time": "sampler", "wavelength": "sampler",
-    "distance": "sampler",
+    "shadow_test": "always", "caustics": "scattered", "aperture": "sampler", "time": "sampler",
+    "wavelength": "sampler", "distance": "sampler",
 }  # fmt: skip
 
 #: The same for the slots that only integrators with light paths have.

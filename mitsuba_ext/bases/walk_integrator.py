@@ -29,7 +29,7 @@ from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_gr
 from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
-from ..transport.estimator import CameraRays
+from ..transport.estimator import CameraRays, Estimator
 from ..transport.observer import Observer
 from ..transport.path_decisions import SceneQuery
 from ..transport.queries.aovs import output_variables
@@ -300,8 +300,13 @@ class WalkIntegrator(StagedIntegrator):
 
     def estimators(self, request: Request, spp: int, learning: LearningPlan) -> Estimators:
         """The function that makes the estimators of the stages of a render with ``spp`` samples per
-        pixel: :meth:`walk`."""
-        return self.walk
+        pixel: :meth:`estimator`."""
+        return self.estimator
+
+    def estimator(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
+        """The estimator of a stage: :meth:`walk`, with what the slot ``caustics`` adds to it."""
+        walk = self.walk(decisions, observer)
+        return walk if decisions.caustics is None else decisions.caustics.around(walk)
 
     def walk(
         self, decisions: Decisions = Decisions(), observer: Observer | None = None  # noqa: B008
@@ -321,8 +326,14 @@ class WalkIntegrator(StagedIntegrator):
         back to its default.
 
         Raises:
-            NotImplementedError: The integrator has light paths.
+            NotImplementedError: The integrator has light paths, or connects through casters.
         """
+        if caustics := self.slots.get("caustics"):
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "caustics" is "{caustics.name}", which connects all '
+                f"samples of a pass at once: it cannot be nested in an integrator that asks for "
+                f'single samples, such as "moment" or "aov"; leave the parameter out'
+            )
         if self.has_light_paths:
             raise NotImplementedError(
                 f'"{self.name}": light paths do not end where a ray begins: it cannot be nested '

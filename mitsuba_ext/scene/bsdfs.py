@@ -21,7 +21,7 @@ def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
     if has_instances(scene):
         bsdfs += _all_in_memory(mi.BSDFPtr)
-    found = [_index(bsdf) for bsdf in set(bsdfs) if _contains(bsdf, classes)]
+    found = [_index(bsdf) for bsdf in set(bsdfs) if contains_bsdf(bsdf, classes)]
     if not found:
         return None
     table = np.zeros(max(found) + 1, bool)
@@ -72,7 +72,8 @@ def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
         )
 
 
-def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
+def contains_bsdf(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
+    """Whether ``bsdf`` is, or contains, one of the ``classes``."""
     if bsdf.class_name() in classes:
         return True
 
@@ -83,7 +84,7 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
             self.is_found = False
 
         def put(self, _name: str, value: object, _flags: int, *_more: object) -> None:
-            self.is_found |= isinstance(value, mi.BSDF) and _contains(value, classes)
+            self.is_found |= isinstance(value, mi.BSDF) and contains_bsdf(value, classes)
 
     nested = Nested()
     bsdf.traverse(nested)

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
+from .estimator import Estimator
 from .numbers import Numbers
 from .path_decisions import (
     ConnectionCount,
@@ -57,6 +58,13 @@ class WarpedLights(Protocol):
         """``next_event``, with warped numbers."""
 
 
+class Caustics(Protocol):
+    """Finds light that smooth surfaces lead to the vertices of a walk."""
+
+    def around(self, walk: Any) -> Estimator:
+        """The estimator that traces the paths of ``walk``, and adds this light."""
+
+
 @dataclass(frozen=True)
 class Decisions(CameraSamples):
     """The decisions of a stage, one for each slot of an integrator. ``None`` stands for the
@@ -72,6 +80,7 @@ class Decisions(CameraSamples):
         connections: The number of points on lights to which a vertex is connected.
         mis: The MIS weights of connections and of scattering.
         shadow_test: Decides whether the shadow ray of a connection is traced.
+        caustics: Finds light that smooth surfaces lead to a vertex.
         query: How rays intersect the scene.
         subpath_selection: Chooses the vertices of light paths to which a vertex is connected.
         light_paths: How many light paths are traced, and what is done with them (only integrators
@@ -86,6 +95,7 @@ class Decisions(CameraSamples):
     connections: ConnectionCount | None = None
     mis: Weights | None = None
     shadow_test: ShadowTest | None = None
+    caustics: Caustics | None = None
     query: SceneQuery | None = None
     subpath_selection: SubpathSelection | None = None
     light_paths: Any = None

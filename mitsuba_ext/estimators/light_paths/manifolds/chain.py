@@ -1,6 +1,6 @@
 """Specular chains: a ray that smooth surfaces reflect and refract, with its derivatives.
 
-Source: H. Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999.
+Source: H. Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999, section 3.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ....transport.bsdfs import sample_bsdf
 from ....transport.path_decisions import SceneQuery
+from .casters import Casters
 
 
 @dataclass
@@ -47,13 +48,13 @@ class Chains:
 
     Parameters:
         query: How rays intersect the scene.
-        casters: Which BSDFs are casters, by their index.
+        ctx: The context for all calls of BSDFs.
     """
 
-    def __init__(self, scene: mi.Scene, query: SceneQuery, shapes, casters: mi.Bool, ctx) -> None:
+    def __init__(
+        self, scene: mi.Scene, query: SceneQuery, casters: Casters, ctx: mi.BSDFContext
+    ) -> None:
         self._scene, self._query, self._casters, self._ctx = scene, query, casters, ctx
-        self._has_meshes = any(s.is_mesh() for s in shapes)
-        self._has_normals = any(s.is_mesh() and s.has_vertex_normals() for s in shapes)
 
     @dr.syntax
     def trace(
@@ -75,11 +76,11 @@ class Chains:
         while dr.hint(going, label="chain"):
             pi = self._query.closest(self._scene, ray, coherent=False, active=going)
             hit = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
-            bsdf = hit.bsdf(ray)
-            met = going & hit.is_valid() & is_caster(self._casters, bsdf)
+            met = going & hit.is_valid() & self._casters.contain(hit.shape)
             transmit = ((transmits >> state.length) & 1) == 1
+            lobe = dr.select(transmit, mi.Float(1), 0)
             bs, weight = sample_bsdf(
-                bsdf, self._ctx, hit, dr.select(transmit, mi.Float(1), 0), mi.Point2f(0.5), met
+                hit.bsdf(ray), self._ctx, hit, lobe, mi.Point2f(0.5), met
             )
             kind = dr.select(
                 transmit, mi.UInt32(int(mi.BSDFFlags.DeltaTransmission)),
@@ -102,19 +103,22 @@ class Chains:
         return state
 
     def _differentiate(self, state, ray, hit, pi, eta, out, transmit, sound) -> None:
+        """Transfers the derivatives along ``ray`` to the surface ``hit``, where the ray turns to
+        ``out``."""
         n = hit.sh_frame.n
         side = dr.sign(-dr.dot(n, ray.d))
         m = n * side
         c = -dr.dot(ray.d, m)
         e = dr.select(transmit, dr.rcp(eta), 1)
         cosine = -dr.dot(out, m)  # negative where the ray is reflected
-        inverse = dr.rcp(dr.dot(hit.n, ray.d))
-        normals = NormalDerivative(hit, pi, self._has_meshes, self._has_normals, sound)
+        change = NormalDerivative(hit, pi, self._casters, sound)
         for i in ("s", "t"):
             dd, dp = getattr(state, "d_" + i), getattr(state, "p_" + i)
+            # Transfer
             dp = dp + hit.t * dd
-            dp = dp - ray.d * (dr.dot(hit.n, dp) * inverse)
-            dm = normals(dp) * side
+            dp = dp - ray.d * (dr.dot(hit.n, dp) / dr.dot(hit.n, ray.d))
+            # Reflection and refraction: out = e d + μ m
+            dm = change.along(dp) * side
             dc = -(dr.dot(dd, m) + dr.dot(ray.d, dm))
             μ = e * c - cosine
             dμ = dr.select(transmit, e * dc - dr.square(e) * c * dc / cosine, 2 * dc)
@@ -123,34 +127,27 @@ class Chains:
 
 
 class NormalDerivative:
-    """How the shading normal changes along the surface at an interaction."""
+    """How the shading normal changes along the surface at an interaction.
 
-    def __init__(self, si: mi.SurfaceInteraction3f, pi, has_meshes, has_normals, active) -> None:
-        # First and second edge, and the normal's change along them
+    It does not use the interaction's derivatives on meshes, because these are wrong in Mitsuba
+    3.9.1 where a mesh has texture coordinates.
+    """
+
+    def __init__(self, si: mi.SurfaceInteraction3f, pi, casters: Casters, active) -> None:
+        # Two vectors in the surface, and the normal's change along them
         self._u, self._v, self._n_u, self._n_v = si.dp_du, si.dp_dv, si.dn_du, si.dn_dv
-        if has_meshes:
-            # Mitsuba's derivatives are wrong where a mesh has texture coordinates
-            mesh, is_mesh = mi.MeshPtr(si.shape), active & si.shape.is_mesh()
-            face = mesh.face_indices(pi.prim_index, is_mesh)
-            p0, p1, p2 = (mesh.vertex_position(i, is_mesh) for i in (face.x, face.y, face.z))
-            change = mi.Vector3f(0), mi.Vector3f(0)
-            if has_normals:
-                smooth = is_mesh & mesh.has_vertex_normals()
-                n0, n1, n2 = (mesh.vertex_normal(i, smooth) for i in (face.x, face.y, face.z))
-                b = pi.prim_uv
-                n = n0 * (1 - b.x - b.y) + n1 * b.x + n2 * b.y
-                inverse = dr.rcp(dr.norm(n))
-                n = n * inverse
-                side = dr.sign(dr.dot(n, si.sh_frame.n))
-                change = [
-                    dr.select(smooth, side * inverse * (x - n * dr.dot(n, x)), 0)
-                    for x in (n1 - n0, n2 - n0)
-                ]
-            self._u, self._v = (
-                dr.select(is_mesh, x, y) for x, y in ((p1 - p0, self._u), (p2 - p0, self._v))
-            )
-            self._n_u, self._n_v = (
-                dr.select(is_mesh, x, y) for x, y in zip(change, (self._n_u, self._n_v))
+        if casters.has_meshes:
+            is_mesh, (e1, e2, n0, n1, n2) = casters.triangle(si.shape, pi.prim_index, active)
+            b = pi.prim_uv
+            n = n0 * (1 - b.x - b.y) + n1 * b.x + n2 * b.y
+            length = dr.norm(n)
+            inverse = dr.select(length > 0, dr.rcp(length), 0)  # 0: flat triangles
+            n = n * inverse
+            inverse = inverse * dr.sign(dr.dot(n, si.sh_frame.n))
+            n_u, n_v = (inverse * (x - n * dr.dot(n, x)) for x in (n1 - n0, n2 - n0))
+            self._u, self._v, self._n_u, self._n_v = (
+                dr.select(is_mesh, x, y)
+                for x, y in ((e1, self._u), (e2, self._v), (n_u, self._n_u), (n_v, self._n_v))
             )
         uu, uv, vv = (
             dr.dot(a, b) for a, b in ((self._u, self._u), (self._u, self._v), (self._v, self._v))
@@ -159,12 +156,12 @@ class NormalDerivative:
         inverse = dr.select(det > 0, dr.rcp(det), 0)
         self._a, self._b, self._c = vv * inverse, -uv * inverse, uu * inverse
 
-    def __call__(self, dp: mi.Vector3f) -> mi.Vector3f:
+    def along(self, dp: mi.Vector3f) -> mi.Vector3f:
         """The change of the normal for a step ``dp`` along the surface."""
         x, y = dr.dot(dp, self._u), dr.dot(dp, self._v)
         return self._n_u * (self._a * x + self._b * y) + self._n_v * (self._b * x + self._c * y)
 
 
-def is_caster(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
-    index = dr.reinterpret_array(mi.UInt32, bsdf)
-    return dr.gather(mi.Bool, table, index, index < dr.width(table))
+def some_wavelengths() -> mi.Spectrum:
+    """Wavelengths for chains whose weight is not used: directions are the same for all."""
+    return mi.Spectrum(550) if mi.is_spectral else mi.Color0f()

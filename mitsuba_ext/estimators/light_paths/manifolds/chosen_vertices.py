@@ -1,0 +1,82 @@
+"""The vertices of camera paths that are connected to lights through casters: one of each path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from ....transport.numbers import hashed_2d
+from ....transport.path_program import Subpaths
+from ....transport.vertex import Vertex
+from ..stored_interaction import as_float, from_words, interaction_words, to_words
+
+#: The largest float below 2^32: it turns a number in [0, 1) to 24 bits of an integer.
+_ALL_BITS = 4294967040.0
+
+#: The number of the hash by which a vertex is chosen.
+_CHOICE = 0xFFFFFFFF
+
+
+class ChosenVertices(Subpaths):
+    """Chooses one vertex of each path in proportion to its throughput.
+
+    Searching for a chain takes longer than a path, and is done once for all vertices: the choice is
+    a reservoir with a single place (M. Chao, *A General Purpose Unequal Probability Sampling Plan*,
+    Biometrika 69(3), 1982).
+
+    Parameters:
+        lanes: Number of paths.
+        most_surfaces: The most surfaces of a chain from a vertex at a depth.
+        is_whole: Whether all fields of an interaction are stored.
+    """
+
+    def __init__(
+        self, lanes: int, most_surfaces: Callable[[mi.UInt32], mi.UInt32], is_whole: bool
+    ) -> None:
+        self._lanes, self._most_surfaces, self._is_whole = lanes, most_surfaces, is_whole
+        self._channels = dr.size_v(mi.Spectrum)
+        self._size = self._channels + 3 + interaction_words(is_whole)
+        self._words = dr.empty(mi.Float, lanes * self._size)
+        self._totals = dr.zeros(mi.Float, lanes)
+
+    def gather(self, scene, sampler, vertex, active):
+        seed = mi.UInt32(sampler.next_1d() * _ALL_BITS)
+        h, importance = vertex.path.history, self.importance(vertex)
+        total = h.total + importance
+        active = active & (importance > 0)
+        taken = active & (hashed_2d(seed, mi.UInt32(_CHOICE)).x * total <= importance)
+        words = [*vertex.path.β, importance, as_float(seed), as_float(vertex.depth)]
+        words += to_words(vertex.si, self._is_whole)
+        dr.scatter(self._words, mi.ArrayXf(words), h.lane, taken)
+        dr.scatter(self._totals, total, h.lane, active)
+        return mi.Spectrum(0), mi.UInt32(0)
+
+    def importance(self, vertex: Vertex) -> mi.Float:
+        """The importance of a vertex; 0 where it has no connections through casters."""
+        connects = mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+        connects &= self._most_surfaces(vertex.depth) > 0
+        return dr.select(connects, dr.max(vertex.path.β), 0)
+
+    def schedule(self) -> None:
+        """Schedules what is stored for evaluation."""
+        dr.schedule(self._words, self._totals)
+
+    def load(
+        self,
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, mi.UInt32, mi.UInt32, mi.Bool]:
+        """The chosen vertex of each path: the interaction, the throughput / probability of the
+        choice, the depth, the seed of the random numbers of its connection, and whether there is
+        any."""
+        lane = dr.arange(mi.UInt32, self._lanes)
+        total = dr.gather(mi.Float, self._totals, lane)
+        exists = total > 0
+        w = dr.gather(mi.ArrayXf, self._words, lane, exists, shape=(self._size, self._lanes))
+        β, (importance, seed, depth, *words) = (
+            mi.Spectrum(*(w[i] for i in range(self._channels))),
+            (w[i] for i in range(self._channels, self._size)),
+        )
+        β *= dr.select(exists, total / importance, 0)
+        seed, depth = (dr.reinterpret_array(mi.UInt32, word) for word in (seed, depth))
+        return from_words(words, self._is_whole), β, depth, seed, exists

@@ -1,0 +1,113 @@
+"""The estimator with connections through casters: a walk, and one chain for each path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ....transport.estimator import CameraRays, Sample
+from ....transport.path_program import PathProgram
+from ....transport.walk import Walk
+from .chosen_vertices import ChosenVertices
+from .connections import MOST_SURFACES, ManifoldConnections
+
+#: The number of surfaces of chains that no connection finds.
+_NEVER = 255
+
+
+@dataclass
+class History:
+    """The casters that a path has met since the last vertex that could be connected.
+
+    Attributes:
+        o, d, pdf: Origin and direction of the ray that left the vertex, and its density.
+        length: The number of casters; ``_NEVER`` where no connection finds the path.
+        transmits: Bit i tells whether caster i has transmitted the ray.
+        lane: The number of the path.
+        total: The importance of all vertices before.
+    """
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    pdf: mi.Float
+    length: mi.UInt32
+    transmits: mi.UInt32
+    lane: mi.UInt32
+    total: mi.Float
+
+
+class ManifoldProgram(PathProgram):
+    """Follows paths whose vertices are connected to lights through casters, and weighs light that
+    they hit behind casters against these connections.
+
+    Parameters:
+        connections: The connections.
+        vertices: What is stored of the paths of this pass.
+        lanes: Number of paths.
+    """
+
+    def __init__(
+        self, connections: ManifoldConnections, vertices: ChosenVertices, lanes: int
+    ) -> None:
+        self._connections, self.subpaths, self._lanes = connections, vertices, lanes
+
+    def begin(self, ray):
+        return History(
+            mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(0), mi.UInt32(_NEVER), mi.UInt32(0),
+            dr.arange(mi.UInt32, self._lanes), mi.Float(0),
+        )  # fmt: skip
+
+    def leave(self, vertex, bs):
+        h, si = vertex.path.history, vertex.si
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        passes = self._connections.passes(si) & (h.length < MOST_SURFACES)
+        # Only chains of refractions have more than one surface
+        passes &= (h.length == 0) | (transmitted & (h.transmits != 0))
+        ray = self._connections.ray(si, si.to_world(bs.wo))
+        bit = dr.select(transmitted, mi.UInt32(1) << h.length, 0)
+        return History(
+            dr.select(is_delta, h.o, ray.o),
+            dr.select(is_delta, h.d, ray.d),
+            dr.select(is_delta, h.pdf, bs.pdf),
+            dr.select(is_delta, dr.select(passes, h.length + 1, _NEVER), 0),
+            dr.select(is_delta, h.transmits | bit, 0),
+            h.lane,
+            h.total + self.subpaths.importance(vertex),
+        )
+
+    def emission(self, weights, scene, si, ds, path, pdf):
+        length = path.history.length
+        own = (length > 0) & (length != _NEVER) & (ds.emitter != None)  # noqa: E711
+        mis = self._connections.weight(path, si, ds, own)
+        return dr.select(own, mis, weights.emission(path.arrival.pdf, pdf))
+
+
+@dataclass
+class ManifoldTracer:
+    """Traces camera paths, and connects one vertex of each through casters. It is an
+    :class:`Estimator`.
+
+    Parameters:
+        walk: Traces the camera paths.
+        connections: The connections.
+    """
+
+    walk: Walk
+    connections: ManifoldConnections
+
+    def __call__(
+        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        lanes = dr.width(rays.ray)
+        vertices = self.connections.vertices(lanes)
+        program = ManifoldProgram(self.connections, vertices, lanes)
+        # Evaluated now, since later kernels of the pass read the rays again
+        dr.schedule(rays)
+        sample = replace(self.walk, program=program)(scene, sampler, rays, active)
+        vertices.schedule()
+        dr.eval(sample)
+        L, tested = self.connections.gather(vertices, rays)
+        return replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
