@@ -33,6 +33,10 @@ MOST_SURFACES = 2
 #: of glass); and the fraction that begins straight towards the light.
 _REFLECTED, _SINGLE, _STRAIGHT = 0.25, 0.1, 0.5
 
+#: The probability of finding a chain that MIS weights assume. The true one is unknown where
+#: scattering has found the chain, and weights must agree.
+_ASSUMED_CHANCE = 0.1
+
 #: The numbers of hashes that no trial uses.
 _LIGHT_NUMBERS = 0xFFFF0000
 
@@ -101,6 +105,7 @@ class ManifoldConnections:
         by_us = light.probability * dr.select(
             light.is_infinite, light.pdf_direction, light.pdf_position
         )
+        by_us *= _ASSUMED_CHANCE
         mis = power_heuristic(by_us, pdf * end.chance * miss.density * cosine)
         mis = dr.select(light.is_delta_position | light.is_delta_direction, 1, mis)
         L = β * value * end.weight * emitted * (miss.density * mi.Float(found.trials) * mis)
@@ -170,7 +175,7 @@ class ManifoldConnections:
         )
         index = self._emission.index(ds.emitter, active)
         direction *= self._emission.chance(index, active)
-        by_us = dr.select(is_infinite, direction, position)
+        by_us = _ASSUMED_CHANCE * dr.select(is_infinite, direction, position)
         by_scattering = h.pdf * chain.chance * miss.density
         by_scattering *= dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
         return dr.select(active & miss.is_sound, power_heuristic(by_scattering, by_us), 1)
