@@ -404,7 +404,8 @@ class WalkIntegrator(StagedIntegrator):
         for slot, parameters in self.slots.items():
             if not parameters.sees_media:
                 what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
-                refuse_media(scene, what, 'choose another one, such as "contribution"')
+                default = next(iter(SLOTS[slot]))
+                refuse_media(scene, what, f'choose another one, such as "{default}"')
         refuse_moving_grids(scene, f'"{self.name}"')
         refuse_missing_colours(scene, f'"{self.name}"')
 

@@ -1,0 +1,238 @@
+"""Connections through casters: derivatives of chains, known answers, and scenes without casters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters
+from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
+from mitsuba_ext.transport.queries.scene import scene_query
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+GLASS = {"type": "dielectric", "int_ior": 1.5}
+MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+
+
+def _plane(height: float, bsdf: dict, size: float = 2.0, down: bool = False) -> dict[str, Any]:
+    to_world = mi.ScalarTransform4f().translate([0, 0, height]).scale(size)
+    if down:
+        to_world = to_world @ mi.ScalarTransform4f().rotate([1, 0, 0], 180)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+def _lamp(size: float = 0.3) -> dict[str, Any]:
+    lamp = _plane(2.0, GREY, size, down=True)
+    return {**lamp, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 40.0}}}
+
+
+def _camera(origin: list[float], target: list[float], size: int = 8, fov: float = 30.0) -> Any:
+    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0])
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    return {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
+
+
+def _scene(**parts: Any) -> mi.Scene:
+    sensor = parts.pop("sensor", _camera([0.2, -2.5, 2.5], [0, 0, 0], fov=45.0))
+    return mi.load_dict({"type": "scene", "sensor": sensor, **parts})
+
+
+def _render(scene: mi.Scene, spp: int = 64, seed: int = 0, **parameters: Any) -> np.ndarray:
+    plugin = {"type": "composed_path", "max_depth": 6, "caustics": "manifold", **parameters}
+    return np.array(mi.render(scene, integrator=mi.load_dict(plugin), spp=spp, seed=seed))
+
+
+def _wavy(with_coordinates: bool) -> mi.Mesh:
+    """A curved surface of 72 triangles with interpolated normals."""
+    count = 7
+    x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count), indexing="ij")
+    corners = np.stack([x, y, 0.2 * np.sin(2 * x) * np.cos(y)], -1).reshape(-1, 3)
+    index = np.arange(count**2).reshape(count, count)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    bsdf = mi.load_dict({"type": "dielectric"})
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    mesh = mi.Mesh("wavy", count**2, len(faces), props=props, has_vertex_normals=True,
+                   has_vertex_texcoords=with_coordinates)  # fmt: skip
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
+    parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    if with_coordinates:
+        turned = corners[:, :2] @ np.array([[0.3, 0.8], [-2.0, 0.1]])
+        parameters["vertex_texcoords"] = mi.Float(turned.astype(np.float32).ravel())
+    parameters.update()
+    return mesh
+
+
+def _casters() -> dict[str, Any]:
+    metal = {"type": "twosided", "bsdf": {"type": "conductor"}}
+    return {
+        "sphere": {"type": "sphere", "radius": 0.8, "bsdf": GLASS},
+        "metal_sphere": {"type": "sphere", "radius": 0.8, "bsdf": metal},
+        "plane": _plane(0.0, GLASS),
+        "cylinder": {
+            "type": "cylinder", "p0": [-1, 0, 0], "p1": [1, 0, 0], "radius": 0.7, "bsdf": metal,
+        },
+        "mesh": _wavy(False),
+        "mesh_with_coordinates": _wavy(True),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("transmits", [0, 1, 3])
+@pytest.mark.parametrize("kind", [
+    "sphere", "metal_sphere", "plane", "cylinder", "mesh", "mesh_with_coordinates",
+])  # fmt: skip
+def test_derivatives_of_chains_are_those_of_finite_differences(kind: str, transmits: int) -> None:
+    caster = _casters()[kind]
+    glass = not kind.startswith(("metal", "cylinder"))
+    length = 2 if transmits == 3 else 1
+    if transmits and not glass or length == 2 and kind != "sphere":
+        pytest.skip("no such chain")
+    scene = _scene(caster=caster, lamp=_lamp())
+    casters = Casters(scene)
+    chains = Chains(scene, scene_query(scene), casters, mi.BSDFContext())
+    o, d = mi.Point3f(0.3, 0.2, 1.7), dr.normalize(mi.Vector3f(-0.22, -0.05, -1.0))
+    frame, h = mi.Frame3f(d), 2e-3
+
+    def end(s: float, t: float):
+        turned = dr.normalize(d + s * frame.s + t * frame.t)
+        ray = mi.Ray3f(o, turned)
+        return chains.trace(ray, mi.UInt32(length), mi.UInt32(transmits), mi.Bool(False),
+                            mi.Bool(True))  # fmt: skip
+
+    state = end(0, 0)
+    assert state.is_sound[0] and state.length[0] == length
+    for name, plus, minus in (("s", end(h, 0), end(-h, 0)), ("t", end(0, h), end(0, -h))):
+        for what in ("p", "d"):
+            expected = (getattr(plus, what) - getattr(minus, what)) / (2 * h)
+            found = np.array(getattr(state, f"{what}_{name}")).ravel()
+            np.testing.assert_allclose(found, np.array(expected).ravel(), rtol=5e-3, atol=5e-3)
+
+
+def test_a_point_light_in_a_mirror_is_a_light_behind_it() -> None:
+    """Its image is as bright as the light itself would be at the mirrored place."""
+    camera = _camera([0, 0, 1.5], [0, 0, 0], fov=2.0)
+    point = {"type": "point", "position": [0.3, 0, 0.5], "intensity": {"type": "rgb", "value": 1.0}}
+    floor = _plane(0.0, GREY)
+    scene = _scene(floor=floor, mirror=_plane(2.0, MIRROR, 4.0), light=point, sensor=camera)
+    alone = _render(_scene(floor=floor, light=point, sensor=camera), 16)
+    image = {**point, "position": [0.3, 0, 3.5]}
+    expected = alone + _render(_scene(floor=floor, light=image, sensor=camera), 16)
+    # The number of trials is random: the mean of the image is known to 0.5 %
+    found = _render(scene, 1024, max_depth=3)
+    np.testing.assert_allclose(found.mean(), expected.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("height", [0.2, 0.8])
+def test_the_sun_through_flat_water_keeps_its_flux(height: float) -> None:
+    """A fraction F0 is reflected; the rest illuminates the floor, at any depth."""
+    water = {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0}
+    irradiance = {"type": "rgb", "value": 1.0}
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": irradiance}
+    camera = _camera([0.02, 0, 0.1], [0, 0, 0], fov=10.0)
+    scene = _scene(floor=_plane(0.0, GREY), water=_plane(height, water), sun=sun, sensor=camera)
+    transmitted = 1 - (0.33 / 2.33) ** 2
+    image = _render(scene, 1024, max_depth=3)
+    # The number of trials is random: the mean of the image is known to 0.6 %
+    np.testing.assert_allclose(image.mean(), 0.5 / np.pi * transmitted, rtol=0.02)
+
+
+def _statistical() -> dict[str, dict[str, Any]]:
+    floor, lamp, sky = _plane(0.0, GREY), _lamp(), {"type": "constant", "radiance": 0.4}
+    ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4}
+    to_world = mi.ScalarTransform4f().translate([0, 0, 0.7]).scale([1, 1, 0.2])
+    box = {"type": "cube", "to_world": to_world}
+    inner = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.1, "bsdf": GREY,
+             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}}  # fmt: skip
+    return {
+        "water": {"floor": floor, "water": _plane(0.5, GLASS, 3.0), "lamp": lamp, "sky": sky},
+        "ball": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": lamp},
+        "metal_ball": {"floor": floor, "ball": {**ball, "bsdf": MIRROR}, "lamp": lamp},
+        # A mesh without normals beside one with normals
+        "slab": {"floor": floor, "slab": {**box, "bsdf": GLASS}, "wavy": _wavy(True), "lamp": lamp},
+        "lamp_in_glass": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": inner},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("depth", [3, 4, 6])
+@pytest.mark.parametrize("name", ["water", "ball", "metal_ball", "slab", "lamp_in_glass"])
+def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
+    scene = _scene(**_statistical()[name])
+    means = []
+    for spp, plugin in ((4096, {"type": "path"}), (256, {"type": "composed_path",
+                                                         "caustics": "manifold"})):  # fmt: skip
+        integrator = mi.load_dict({**plugin, "max_depth": depth})
+        renders = [
+            np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed)).mean()
+            for seed in range(16)
+        ]
+        means.append((np.mean(renders), np.std(renders, ddof=1) / 4))
+    (expected, error), (found, own_error) = means
+    assert abs(found - expected) < 4 * np.hypot(error, own_error)
+    assert np.hypot(error, own_error) < 0.05 * expected
+
+
+# ---- Where nothing is connected ----
+
+
+@pytest.mark.parametrize("bsdf", [
+    GREY, {"type": "roughdielectric"}, {"type": "thindielectric"},
+    {"type": "mask", "nested": GLASS},
+    {"type": "bumpmap", "arbitrary": {"type": "checkerboard"}, "nested": GLASS},
+])  # fmt: skip
+def test_without_casters_the_image_is_that_of_scattering(bsdf: dict[str, Any]) -> None:
+    scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": bsdf}, lamp=_lamp())
+    assert not Casters(scene).exist
+    np.testing.assert_array_equal(_render(scene, 4), _render(scene, 4, caustics="scattered"))
+
+
+@pytest.mark.parametrize("parts, depth", [({}, 6), ({"lamp": True}, 2)])
+def test_without_lights_or_room_for_a_chain_the_image_is_that_of_scattering(parts, depth) -> None:
+    lights = {"lamp": _lamp()} if parts else {}
+    scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": GLASS}, **lights)
+    expected = _render(scene, 4, max_depth=depth, caustics="scattered")
+    np.testing.assert_array_equal(_render(scene, 4, max_depth=depth), expected)
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    scene = _scene(**_statistical()["ball"])
+    first = _render(scene, 16, seed=3)
+    np.testing.assert_array_equal(first, _render(scene, 16, seed=3))
+    assert (first != _render(scene, 16, seed=4)).any()
+
+
+# ---- Refusals ----
+
+
+def _error(act: Any) -> str:
+    with pytest.raises((RuntimeError, NotImplementedError)) as caught:
+        act()
+    return str(caught.value) + str(caught.value.__cause__)
+
+
+def test_media_are_refused_in_a_sentence() -> None:
+    fog = {"type": "homogeneous", "sigma_t": 0.5}
+    ball = {"type": "sphere", "bsdf": GLASS, "interior": fog}
+    scene = _scene(floor=_plane(0.0, GREY), ball=ball, lamp=_lamp())
+    message = _error(lambda: _render(scene, 1))
+    assert '"caustics" is "manifold"' in message and '"scattered"' in message
+
+
+def test_integrators_that_ask_for_single_samples_are_refused() -> None:
+    scene = _scene(**_statistical()["ball"])
+    nested = {"type": "composed_path", "caustics": "manifold"}
+    moment = mi.load_dict({"type": "moment", "nested": nested})
+    assert '"caustics" is "manifold"' in _error(lambda: mi.render(scene, integrator=moment, spp=1))
+
+
+@pytest.mark.parametrize("plugin", ["composed_prb", "bdpt"])
+def test_integrators_without_the_slot_do_not_know_it(plugin: str) -> None:
+    message = _error(lambda: mi.load_dict({"type": plugin, "caustics": "manifold"}))
+    assert "caustics" in message
