@@ -80,6 +80,17 @@ class ComposedPath(WalkIntegrator):
        - Whether the shadow ray of a connection is traced: :monosp:`always`, by
          :monosp:`visibility_roulette` (learned), or by a nested :monosp:`visibility_roulette` with
          parameters. (Default: always)
+     * - caustics
+       - |string|
+       - How paths find light that smooth glass, water or mirrors lead to a vertex. With
+         :monosp:`scattered`, only scattered rays find it, and they rarely hit a small light. With
+         :monosp:`manifold`, one vertex of each path is also connected to a light through one
+         reflection, or one or two refractions, by Newton's method. It takes 3 to 13 times as long
+         as :monosp:`path` for a sample. The surfaces are meshes, spheres, rectangles, disks and
+         cylinders that have a :monosp:`dielectric` or :monosp:`conductor` without bump, normal or
+         opacity map; other surfaces, instances, and scenes that move or disperse light are left to
+         scattering. It refuses participating media and :monosp:`scattering=swarm`. (Default:
+         scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a
@@ -159,7 +170,10 @@ class ComposedPath(WalkIntegrator):
     Source: the algorithms of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T. Kajiya, *The
     Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling);
     P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section
-    3.4 (:monosp:`linear`). The pages of the decisions name their own sources.
+    3.4 (:monosp:`linear`); J. Hanika, M. Droske, L. Fascione, *Manifold Next Event Estimation*,
+    2015, and T. Zeltner, I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering
+    High-Frequency Caustics and Glints*, 2020 (:monosp:`caustics=manifold`). The pages of the
+    decisions name their own sources.
 
     .. tabs::
         .. code-tab:: xml

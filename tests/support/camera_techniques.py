@@ -226,6 +226,20 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
     "adaptive_learning": Technique(
         "adaptive", nested="neepp", thorough=Checks(cases=["plain", "one_sample"])
     ),
+    # ``test_manifolds.py`` has chains, known answers and refusals
+    "manifold": Technique(
+        "composed_path", {"caustics": "manifold"},
+        checks=Checks(
+            furnaces=["furnace_glass"], depths=[-1],
+            cases=("materials", "delta_lights", "no_light", "empty", "film_of_one_pixel"),
+        ),
+        thorough=Checks(
+            ["mirrors_and_glass"], ["llvm_ad_spectral"], FURNACES, [3],
+            ("plain", "scaled_by_1e4", "sun_of_one_texel", "constant_environment", "instances",
+             "textured_two_sided_lights", "smooth_normal_lamp", "cropped_film", "thin_lens",
+             "hidden_emitters", "one_sample"),
+        ),
+    ),
     # The heuristics of multiple importance sampling
     **{
         f"mis_{heuristic}": Technique(

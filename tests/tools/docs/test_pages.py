@@ -41,7 +41,7 @@ VALUES = {
     "aovs": "d:depth", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "distance": "swarm",
-    "light_numbers": "swarm", "scattering": "swarm",
+    "light_numbers": "swarm", "scattering": "swarm", "caustics": "manifold",
     "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
     "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,

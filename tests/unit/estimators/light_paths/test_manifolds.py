@@ -176,7 +176,7 @@ def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
         means.append((np.mean(renders), np.std(renders, ddof=1) / 4))
     (expected, error), (found, own_error) = means
     assert abs(found - expected) < 4 * np.hypot(error, own_error)
-    assert np.hypot(error, own_error) < 0.05 * expected
+    assert np.hypot(error, own_error) < 0.1 * expected
 
 
 # ---- Where nothing is connected ----
@@ -185,9 +185,12 @@ def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
 @pytest.mark.parametrize("bsdf", [
     GREY, {"type": "roughdielectric"}, {"type": "thindielectric"},
     {"type": "mask", "nested": GLASS},
-    {"type": "bumpmap", "arbitrary": {"type": "checkerboard"}, "nested": GLASS},
+    {"type": "bumpmap", "nested": GLASS},
 ])  # fmt: skip
 def test_without_casters_the_image_is_that_of_scattering(bsdf: dict[str, Any]) -> None:
+    if bsdf["type"] == "bumpmap":
+        bumps = mi.Bitmap(np.random.default_rng(1).random((4, 4, 1), np.float32))
+        bsdf = {**bsdf, "bumps": {"type": "bitmap", "bitmap": bumps, "raw": True}}
     scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": bsdf}, lamp=_lamp())
     assert not Casters(scene).exist
     np.testing.assert_array_equal(_render(scene, 4), _render(scene, 4, caustics="scattered"))
