@@ -77,16 +77,19 @@ class Casters:
         )  # fmt: skip
         return is_mesh, [mi.Vector3f(words[i], words[i + 1], words[i + 2]) for i in range(0, 15, 3)]
 
-    def near(self, u: mi.Float, v: mi.Vector3f) -> mi.Point3f:
-        """A random point near a caster. Its density is positive everywhere on all of them.
+    def near(self, u: mi.Float, v: mi.Vector3f, w: mi.Float) -> mi.Point3f:
+        """A random point near a caster. Its density is positive everywhere: a caster may be long
+        and thin, and have no point of the table near its end.
 
         Parameters:
-            u: Uniform number, which chooses a point.
-            v: Three more, which move it.
+            u: Uniform number, which chooses a point of the table.
+            v, w: Four more, which move it. ``w`` decides how far at most: k times the usual
+                distance with a probability of 1 / k².
         """
         index = dr.minimum(mi.UInt32(u * mi.Float(self._count)), self._count - 1)
         entry = dr.gather(mi.Vector4f, self._points, index)
-        return mi.Point3f(entry.x, entry.y, entry.z) + entry.w * (2 * v - 1)
+        reach = entry.w * dr.rsqrt(1 - w)
+        return mi.Point3f(entry.x, entry.y, entry.z) + reach * (2 * v - 1)
 
     def _entry(self, shape: mi.ShapePtr) -> mi.UInt32:
         index = dr.reinterpret_array(mi.UInt32, shape)

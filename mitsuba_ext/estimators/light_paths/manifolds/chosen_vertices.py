@@ -12,8 +12,8 @@ from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
 from ..stored_interaction import as_float, from_words, interaction_words, to_words
 
-#: The largest float below 2^32: it turns a number in [0, 1) to 24 bits of an integer.
-_ALL_BITS = 4294967040.0
+#: The bits of a random number. Seeds of so few bits would repeat in large renders.
+_BITS = 24
 
 #: The number of the hash by which a vertex is chosen.
 _CHOICE = 0xFFFFFFFF
@@ -42,7 +42,8 @@ class ChosenVertices(Subpaths):
         self._totals = dr.zeros(mi.Float, lanes)
 
     def gather(self, scene, sampler, vertex, active):
-        seed = mi.UInt32(sampler.next_1d() * _ALL_BITS)
+        x, y = (mi.UInt32(u * 2.0**_BITS) for u in sampler.next_2d())
+        seed = x ^ (y << (32 - _BITS))
         h, importance = vertex.path.history, self.importance(vertex)
         total = h.total + importance
         active = active & (importance > 0)

@@ -139,8 +139,8 @@ class ManifoldConnections:
         self, seed: mi.UInt32, trial: mi.UInt32, si: mi.SurfaceInteraction3f, target: Target
     ) -> Seed:
         """Where a trial begins: towards a random point near a caster, or towards the light."""
-        a, b, c = (hashed_2d(seed, trial * 3 + i) for i in range(3))
-        d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y)) - si.p)
+        a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
+        d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
         if not self._casters.refract:
             return Seed(d, mi.UInt32(0), mi.Bool(False))
         straight = dr.select(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
+from ....transport.frozen import frozen
+from ....transport.numbers import Numbers, copied, go_to, reached
 from ....transport.path_program import PathProgram
 from ....transport.walk import Walk
 from .chosen_vertices import ChosenVertices
@@ -101,13 +104,31 @@ class ManifoldTracer:
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
     ) -> Sample:
+        # Evaluated now, since several kernels read the rays
+        dr.eval(rays)
+        trace = _traced if self.walk.observer.can_be_frozen else _traced.__wrapped__
+        sample, place = trace(self, scene, sampler, rays, mi.Bool(active))
+        go_to(sampler, place)
+        return sample
+
+    def trace(
+        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        """The samples of these rays."""
         lanes = dr.width(rays.ray)
         vertices = self.connections.vertices(lanes)
         program = ManifoldProgram(self.connections, vertices, lanes)
-        # Evaluated now, since later kernels of the pass read the rays again
-        dr.schedule(rays)
         sample = replace(self.walk, program=program)(scene, sampler, rays, active)
         vertices.schedule()
         dr.eval(sample)
         L, tested = self.connections.gather(vertices, rays)
         return replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
+
+
+@frozen
+def _traced(
+    tracer: ManifoldTracer, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+) -> tuple[Sample, Any]:
+    """The samples of ``tracer``, and the position that the sampler has reached."""
+    numbers = copied(sampler)
+    return tracer.trace(scene, numbers, rays, active), reached(numbers)
