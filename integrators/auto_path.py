@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.bases.slots import auto_techniques
+from mitsuba_ext.bases.slots import auto_techniques, read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 
@@ -45,6 +45,10 @@ class AutoPath(WalkIntegrator):
        - |float|
        - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
          (Default: 0)
+     * - caustics
+       - |string|
+       - Whether paths also connect to lights through smooth glass and mirrors
+         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -89,4 +93,5 @@ class AutoPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.fill(props, **auto_techniques(self.name))
+        caustics = read_slot(self.name, props, "caustics")
+        self.fill(props, caustics=caustics, **auto_techniques(self.name))

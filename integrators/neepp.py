@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.bases.slots import LIGHT_CHOICES
+from mitsuba_ext.bases.slots import LIGHT_CHOICES, read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.shadow_rejection.parameters import RejectedShadowRays
@@ -90,6 +90,10 @@ class NEEPlusPlus(WalkIntegrator):
        - |float|
        - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
          (Default: 0)
+     * - caustics
+       - |string|
+       - Whether paths also connect to lights through smooth glass and mirrors
+         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -139,5 +143,6 @@ class NEEPlusPlus(WalkIntegrator):
         lights = make_lights(read) if make_lights else None
         learns = lights is not None and lights.tells_visibility
         rejection = RejectedShadowRays(read, has_own_map=not learns) if rejects else None
-        self.fill(props, next_event=lights, shadow_test=rejection)
+        caustics = read_slot(self.name, props, "caustics")
+        self.fill(props, next_event=lights, shadow_test=rejection, caustics=caustics)
         read.refuse_without_effect(_CONDITIONS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
@@ -72,6 +73,10 @@ class PSSGuided(WalkIntegrator):
        - |float|
        - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
          (Default: 0)
+     * - caustics
+       - |string|
+       - Whether paths also connect to lights through smooth glass and mirrors
+         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -116,6 +121,7 @@ class PSSGuided(WalkIntegrator):
             directions=Guided(self.reader(props)),
             roulette=GuidedRoulette(),
             connections=Connections(none) if none else None,
+            caustics=read_slot(self.name, props, "caustics"),
         )
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.swarming.parameters import TECHNIQUES
@@ -92,6 +93,10 @@ class SwarmPath(WalkIntegrator):
        - |float|
        - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
          (Default: 0)
+     * - caustics
+       - |string|
+       - Whether paths also connect to lights through smooth glass and mirrors
+         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -164,6 +169,7 @@ class SwarmPath(WalkIntegrator):
         # Slots are filled even if the scene does not use their numbers
         self.fill(
             props,
+            caustics=read_slot(self.name, props, "caustics"),
             **{
                 slot: _MAPS[slot](self.reader(props), always)
                 for key, slot in _SLOTS.items()

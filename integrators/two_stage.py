@@ -6,6 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
@@ -63,6 +64,10 @@ class TwoStage(WalkIntegrator):
        - |float|
        - **Biased**: the largest light of a sample, see :class:`composed_path`. 0 clamps nothing.
          (Default: 0)
+     * - caustics
+       - |string|
+       - Whether paths also connect to lights through smooth glass and mirrors
+         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -102,7 +107,8 @@ class TwoStage(WalkIntegrator):
         super().__init__(props)
         light_samples = self.parameter(props, "light_samples", 16, minimum=1, maximum=1024)
         lights = TwoStageLights(self.reader(props))
-        slots: dict[str, Any] = {"next_event": lights}
+        caustics = read_slot(self.name, props, "caustics")
+        slots: dict[str, Any] = {"next_event": lights, "caustics": caustics}
         if light_samples > 1:
             values = {"count": light_samples, "vertices": lights.vertices}
             slots["connections"] = Connections(ParameterReader.of_defaults(self.name, **values))

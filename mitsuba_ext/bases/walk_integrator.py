@@ -21,6 +21,7 @@ from ..planning.pilots import pilot_samples, stage_weights
 from ..planning.planner import Estimators, LearningPlan, Planner, Saver
 from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
+from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
@@ -220,6 +221,10 @@ class WalkIntegrator(StagedIntegrator):
     @property
     def sample_cost(self) -> int:
         return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
+
+    @property
+    def sample_bytes(self) -> SampleBytes:
+        return SampleBytes(max((t.sample_bytes for t in self.slots.values()), default=0))
 
     def samples_per_set(self, spp: int) -> int:
         return max((t.samples_per_set(spp) for t in self.slots.values()), default=1)

@@ -151,6 +151,8 @@ class Technique:
         tells_visibility: Whether it learns which lights a vertex sees, so that a shadow test can
             use that (:meth:`~mitsuba_ext.planning.learner.Learner.shadow_test`).
         sample_cost: The approximate time of a sample in units of the time of a path.
+        sample_bytes: Bytes that it stores for each sample of a pass, about; 0 if no more than a
+            path.
         needs_equal_samples: Why all pixels must get the same number of samples, as the end of an
             error message with ``{slot}``; empty if they need not.
     """
@@ -170,6 +172,7 @@ class Technique:
     sees_media = True
     tells_visibility = False
     sample_cost = 1
+    sample_bytes = 0
     needs_equal_samples = ""
 
     def __init__(self, read: ParameterReader | None = None) -> None:

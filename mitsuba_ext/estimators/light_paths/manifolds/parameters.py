@@ -17,6 +17,9 @@ from .casters import Casters
 from .connections import ManifoldConnections
 from .manifold_tracer import ManifoldTracer
 
+#: The segments of the shortest path through a caster: to a surface, to the caster, to a light.
+_SHORTEST = 3
+
 
 @dataclass(frozen=True)
 class ManifoldCaustics:
@@ -40,26 +43,44 @@ class Manifold(Technique):
     name = "manifold"
     slots, words = ("caustics",), {"manifold": {}}
     camera_paths_only, sees_media = True, False
+    #: Most scenes of docs/results/caustics.md take 3 to 8 times as long as with ``path``. A sample
+    #: stores a vertex, a task and its result besides its ray.
+    sample_cost, sample_bytes = 4, 256
 
     def check_together(self, plugin, slots):
         if "scattering" in slots:
             raise ValueError(
                 f'"{plugin}": the parameter "caustics" is "manifold", which knows the densities of '
-                f'BSDFs only: leave "scattering" out'
+                f'BSDFs only: leave "scattering" out ("direction_map" in "swarm_path")'
             )
 
     def decision(self, setting: Setting) -> Any | None:
         scene = setting.scene
-        # A chain has at least three segments. Moving or dispersive scenes are left to scattering
-        if setting.max_depth < 3 or not scene.emitters() or movers(scene):
-            return None
-        if mi.is_spectral and disperses(scene.shapes()):
-            return None
         casters = Casters(scene)
-        if not casters.exist:
+        if reason := _no_effect(scene, setting.max_depth, casters):
+            what = f'"{setting.plugin}": the parameter "caustics" is "manifold", and has no effect'
+            mi.Log(mi.LogLevel.Warn, f"{what}: {reason}")
             return None
         connections = ManifoldConnections(scene, scene_query(scene), casters, setting.max_depth)
         return ManifoldCaustics(connections)
+
+
+def _no_effect(scene: mi.Scene, max_depth: int, casters: Casters) -> str:
+    """Why nothing is connected through casters; empty if something is."""
+    if not scene.emitters():
+        return "the scene has no light"
+    if max_depth < _SHORTEST:
+        return f'"max_depth" is {max_depth}, and such paths have at least {_SHORTEST} segments'
+    if not casters.exist:
+        return (
+            'no mesh, sphere, rectangle, disk or cylinder has a "dielectric" or "conductor" '
+            "without bump, normal or opacity map"
+        )
+    if movers(scene):
+        return "things move"
+    if mi.is_spectral and disperses(scene.shapes()):
+        return "glass disperses light"
+    return ""
 
 
 TECHNIQUES = (Manifold,)
