@@ -89,8 +89,9 @@ class ComposedPath(WalkIntegrator):
          as :monosp:`path` for a sample. The surfaces are meshes, spheres, rectangles, disks and
          cylinders that have a :monosp:`dielectric` or :monosp:`conductor` without bump, normal or
          opacity map; other surfaces, instances, and scenes that move or disperse light are left to
-         scattering. It refuses participating media and :monosp:`scattering=swarm`. (Default:
-         scattered)
+         scattering. Light of points and directions that passes more than two surfaces is missing,
+         as with :monosp:`scattered`. It refuses participating media and
+         :monosp:`scattering=swarm`. (Default: scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a

@@ -57,7 +57,7 @@ class Manifold(Technique):
     def decision(self, setting: Setting) -> Any | None:
         scene = setting.scene
         casters = Casters(scene)
-        if reason := _no_effect(scene, setting.max_depth, casters):
+        if reason := no_effect(scene, setting.max_depth, casters):
             what = f'"{setting.plugin}": the parameter "caustics" is "manifold", and has no effect'
             mi.Log(mi.LogLevel.Warn, f"{what}: {reason}")
             return None
@@ -65,7 +65,7 @@ class Manifold(Technique):
         return ManifoldCaustics(connections)
 
 
-def _no_effect(scene: mi.Scene, max_depth: int, casters: Casters) -> str:
+def no_effect(scene: mi.Scene, max_depth: int, casters: Casters) -> str:
     """Why nothing is connected through casters; empty if something is."""
     if not scene.emitters():
         return "the scene has no light"

@@ -11,6 +11,8 @@ import pytest
 
 from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters
 from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
+from mitsuba_ext.estimators.light_paths.manifolds.manifold_tracer import ManifoldTracer
+from mitsuba_ext.estimators.light_paths.manifolds.parameters import no_effect
 from mitsuba_ext.transport.queries.scene import scene_query
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -144,6 +146,19 @@ def test_the_sun_through_flat_water_keeps_its_flux(height: float) -> None:
     np.testing.assert_allclose(image.mean(), 0.5 / np.pi * transmitted, rtol=0.02)
 
 
+def test_searches_may_begin_at_every_part_of_a_thin_caster() -> None:
+    """Its table has no point near some of its parts: 1024 points on a strip 10 000 times as long
+    as wide."""
+    to_world = mi.ScalarTransform4f().scale([10, 0.001, 1])
+    casters = Casters(_scene(strip={"type": "rectangle", "to_world": to_world, "bsdf": GLASS}))
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(1, 1 << 18)
+    v = mi.Vector3f(*(numbers.next_1d() for _ in range(3)))
+    x = np.array(casters.near(numbers.next_1d(), v, numbers.next_1d()).x)
+    counts, _edges = np.histogram(x, 400, (-10, 10))
+    assert (counts > 0).all()
+
+
 def _statistical() -> dict[str, dict[str, Any]]:
     floor, lamp, sky = _plane(0.0, GREY), _lamp(), {"type": "constant", "radiance": 0.4}
     ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4}
@@ -155,22 +170,55 @@ def _statistical() -> dict[str, dict[str, Any]]:
         "water": {"floor": floor, "water": _plane(0.5, GLASS, 3.0), "lamp": lamp, "sky": sky},
         "ball": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": lamp},
         "metal_ball": {"floor": floor, "ball": {**ball, "bsdf": MIRROR}, "lamp": lamp},
+        # Glass through whose open ends light enters
+        "tube": {"floor": floor, "lamp": lamp, "tube": {
+            "type": "cylinder", "p0": [-0.8, 0, 0.6], "p1": [0.8, 0, 0.6], "radius": 0.35,
+            "bsdf": {**GLASS, "specular_transmittance": {"type": "rgb", "value": [0.9, 0.5, 0.2]}},
+        }},
         # A mesh without normals beside one with normals
         "slab": {"floor": floor, "slab": {**box, "bsdf": GLASS}, "wavy": _wavy(True), "lamp": lamp},
         "lamp_in_glass": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": inner},
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [3, 4, 6])
-@pytest.mark.parametrize("name", ["water", "ball", "metal_ball", "slab", "lamp_in_glass"])
+@pytest.mark.parametrize("name", ["water", "ball", "metal_ball", "tube", "slab", "lamp_in_glass"])
 def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
     scene = _scene(**_statistical()[name])
+    _compare(scene, {"type": "path", "max_depth": depth}, 4096, depth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [
+    {"type": "point", "position": [0.3, 0.2, 2]}, {"type": "spot", "cutoff_angle": 30},
+    {"type": "directional", "direction": [0.3, 0.2, -1]},
+])  # fmt: skip
+def test_points_and_directions_of_light_are_seen_as_bdpt_sees_them(light: dict[str, Any]) -> None:
+    """No chain of this length has more than two surfaces."""
+    if light["type"] == "spot":
+        to_world = mi.ScalarTransform4f().look_at([0.3, -0.2, 2.5], [0, 0, 0], [0, 1, 0])
+        light = {**light, "to_world": to_world}
+    ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4, "bsdf": GLASS}
+    scene = _scene(floor=_plane(0.0, GREY), ball=ball, light=light)
+    _compare(scene, {"type": "bdpt", "max_depth": 4}, 256, 4)
+
+
+@pytest.mark.parametrize("preset", [
+    "neepp", "pss_guided", "auto_path", "swarm_path", "two_stage",
+])  # fmt: skip
+def test_presets_have_the_slot(preset: str) -> None:
+    integrator = mi.load_dict({"type": preset, "caustics": "manifold"})
+    assert integrator.slots["caustics"].name == "manifold"
+    assert "caustics" not in mi.load_dict({"type": preset}).slots
+
+
+def _compare(scene: mi.Scene, reference: dict[str, Any], spp: int, depth: int) -> None:
     means = []
-    for spp, plugin in ((4096, {"type": "path"}), (256, {"type": "composed_path",
-                                                         "caustics": "manifold"})):  # fmt: skip
-        integrator = mi.load_dict({**plugin, "max_depth": depth})
+    plugin = {"type": "composed_path", "caustics": "manifold", "max_depth": depth}
+    for count, integrator in ((spp, mi.load_dict(reference)), (256, mi.load_dict(plugin))):
         renders = [
-            np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed)).mean()
+            np.array(mi.render(scene, integrator=integrator, spp=count, seed=seed)).mean()
             for seed in range(16)
         ]
         means.append((np.mean(renders), np.std(renders, ddof=1) / 4))
@@ -202,6 +250,35 @@ def test_without_lights_or_room_for_a_chain_the_image_is_that_of_scattering(part
     scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": GLASS}, **lights)
     expected = _render(scene, 4, max_depth=depth, caustics="scattered")
     np.testing.assert_array_equal(_render(scene, 4, max_depth=depth), expected)
+
+
+@pytest.mark.parametrize("parts, max_depth, expected", [
+    ({"ball": {"type": "sphere", "bsdf": GLASS}}, 6, "no light"),
+    ({"ball": {"type": "sphere", "bsdf": GLASS}, "lamp": True}, 2, '"max_depth" is 2'),
+    ({"lamp": True}, 6, "no mesh, sphere"),
+    ({"moves": True, "lamp": True, "water": {"type": "rectangle", "bsdf": GLASS}}, 6, "move"),
+    ({"ball": {"type": "sphere", "bsdf": GLASS}, "lamp": True}, 6, ""),
+])  # fmt: skip
+def test_a_warning_says_why_nothing_is_connected(parts, max_depth: int, expected: str) -> None:
+    parts = dict(parts)
+    if "lamp" in parts:
+        parts["lamp"] = _lamp()
+    if parts.pop("moves", False):
+        parts["ball"] = {"type": "moving", "translate": [1, 0, 0], "shape": {"type": "sphere"}}
+    scene = _scene(**parts)
+    found = no_effect(scene, max_depth, Casters(scene))
+    assert expected in found and bool(expected) == bool(found)
+
+
+def test_passes_are_recorded(monkeypatch) -> None:
+    """Python traces the walk and the search once, for the first render."""
+    traced = []
+    trace = ManifoldTracer.trace
+    monkeypatch.setattr(ManifoldTracer, "trace", lambda *a: traced.append(1) or trace(*a))
+    scene = _scene(**_statistical()["ball"])
+    for seed in range(3):
+        _render(scene, 4, seed=seed)
+    assert len(traced) == 1
 
 
 def test_the_same_seed_gives_the_same_image() -> None:
