@@ -206,7 +206,7 @@ class WalkIntegrator(StagedIntegrator):
         return LearningPlan(tuple(pilots), remark)
 
     def pace_stage(self, request: Request, spp: int) -> Stage | None:
-        if self.has_light_paths:
+        if self.has_light_paths or "caustics" in self.slots:
             # Camera paths alone would miss the light of some lights, and are much faster
             return None
         # Where maps help much, samples without them are worth less

@@ -11,7 +11,7 @@ its own work, and a default one costs nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -94,11 +94,26 @@ class Walk:
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         """Traces one path for each of the rays."""
+        sample, direct = self.unclamped(scene, sampler, rays, active)
+        return self.clamped(sample, direct)
+
+    def unclamped(
+        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> tuple[Sample, mi.Spectrum | None]:
+        """The samples, not clamped, and the direct light in each of them (``None`` where nothing
+        :attr:`clamps`)."""
         with garbage_left_alone():
             return self._trace(scene, sampler, rays, active)
 
+    def clamped(self, sample: Sample, direct: mi.Spectrum | None) -> Sample:
+        """``sample``, clamped. ``direct`` is its direct light."""
+        if direct is None:
+            return sample
+        indirect = _at_most(sample.L - direct, self.clamp_indirect)
+        return replace(sample, L=_at_most(direct, self.clamp_direct) + indirect)
+
     @dr.syntax
-    def _trace(self, scene, sampler, rays, active) -> Sample:
+    def _trace(self, scene, sampler, rays, active) -> tuple[Sample, mi.Spectrum | None]:
         # What the scene lacks is left out of the kernel: these are Python booleans
         has_emitters = len(scene.emitters()) > 0
         connects = has_emitters and self.max_depth > 1
@@ -283,18 +298,12 @@ class Walk:
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
-        L = self._clamped(L, direct)
-        return Sample(L, valid, scatter_count, shadow_count, connection_count)
+        return Sample(L, valid, scatter_count, shadow_count, connection_count), direct
 
     @property
     def clamps(self) -> bool:
         """Whether light is clamped, so that the image is biased."""
         return self.clamp_direct > 0 or self.clamp_indirect > 0
-
-    def _clamped(self, L: mi.Spectrum, direct) -> mi.Spectrum:
-        if not self.clamps:
-            return L
-        return _at_most(direct, self.clamp_direct) + _at_most(L - direct, self.clamp_indirect)
 
     def _visit(self, connects: bool, state, scene, si, active):
         """What the next event decision knows about a vertex."""

@@ -118,11 +118,13 @@ class ManifoldTracer:
         lanes = dr.width(rays.ray)
         vertices = self.connections.vertices(lanes)
         program = ManifoldProgram(self.connections, vertices, lanes)
-        sample = replace(self.walk, program=program)(scene, sampler, rays, active)
+        walk = replace(self.walk, program=program)
+        sample, direct = walk.unclamped(scene, sampler, rays, active)
         vertices.schedule()
-        dr.eval(sample)
+        dr.eval(sample, direct)
         L, tested = self.connections.gather(vertices, rays)
-        return replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
+        sample = replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
+        return walk.clamped(sample, direct)
 
 
 @frozen

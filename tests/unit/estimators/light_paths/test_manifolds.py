@@ -13,6 +13,7 @@ from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters
 from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
 from mitsuba_ext.estimators.light_paths.manifolds.manifold_tracer import ManifoldTracer
 from mitsuba_ext.estimators.light_paths.manifolds.parameters import no_effect
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.transport.queries.scene import scene_query
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -268,6 +269,19 @@ def test_a_warning_says_why_nothing_is_connected(parts, max_depth: int, expected
     scene = _scene(**parts)
     found = no_effect(scene, max_depth, Casters(scene))
     assert expected in found and bool(expected) == bool(found)
+
+
+def test_clamps_bound_the_light_of_connections_too() -> None:
+    scene = _scene(**_statistical()["ball"])
+    limits = {"clamp_direct": 1e-3, "clamp_indirect": 1e-3}
+    assert _render(scene, 1, **limits).mean(-1).max() < 2.01e-3
+
+
+def test_timed_renders_begin_with_connections() -> None:
+    """A first sample by a plain walk would not have the light of points through glass."""
+    integrator = mi.load_dict({"type": "composed_path", "caustics": "manifold"})
+    scene = _scene(**_statistical()["ball"])
+    assert integrator.pace_stage(Request(scene, scene.sensors()[0]), 16) is None
 
 
 def test_passes_are_recorded(monkeypatch) -> None:
