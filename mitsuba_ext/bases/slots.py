@@ -20,6 +20,7 @@ from ..techniques.resampled_lights import parameters as resampled_lights
 from ..techniques.shadow_rejection import parameters as shadow_rejection
 from ..techniques.spatial_lights import parameters as spatial_lights
 from ..techniques.swarming import parameters as swarming
+from ..techniques.tree_lights import parameters as tree_lights
 from ..techniques.two_stage_lights import parameters as two_stage_lights
 from ..techniques.weighted_points import parameters as weighted_points
 from ..util.errors import did_you_mean
@@ -29,6 +30,7 @@ _TECHNIQUES: tuple[type[Technique], ...] = (
     *guided_directions.TECHNIQUES,
     *spatial_lights.TECHNIQUES,
     *linear_lights.TECHNIQUES,
+    *tree_lights.TECHNIQUES,
     *learned_lights.TECHNIQUES,
     *resampled_lights.TECHNIQUES,
     *two_stage_lights.TECHNIQUES,

@@ -9,8 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..util.arrays import from_numpy
 from .media import has_instances
 from .movers import all_shapes
+
+#: BSDFs that perturb normals, as they appear in ``str(bsdf)``.
+_BUMPED = ("BumpMap[", "NormalMap[")
 
 
 def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
@@ -33,6 +37,22 @@ def is_in_table(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
     """Whether ``bsdf`` is one of the BSDFs that :func:`bsdf_table` has found."""
     index = dr.reinterpret_array(mi.UInt32, bsdf)
     return dr.gather(mi.Bool, table, index, index < dr.width(table))
+
+
+def opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
+    """Which BSDFs reflect only light from the side of the shading normal that is seen: a table over
+    Dr.Jit's indices of BSDFs. False for BSDFs that are not found here (in instances), and for bump
+    and normal maps, whose normals may face away."""
+    transmission = int(mi.BSDFFlags.Transmission)
+    bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+    found = [
+        _index(bsdf) for bsdf in bsdfs
+        if not int(bsdf.flags()) & transmission
+        and not any(name in str(bsdf) for name in _BUMPED)
+    ]  # fmt: skip
+    table = np.zeros(max(found, default=0) + 1, bool)
+    table[found] = True
+    return from_numpy(mi.Bool, table)
 
 
 def has_clear_curves(scene: mi.Scene) -> bool:

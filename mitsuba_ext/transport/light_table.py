@@ -57,11 +57,7 @@ class LightTable(EmitterSampling):
         self._table = alias_rows(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
-        # The first cell of each emitter. Made here: arrays must exist before kernels are recorded
-        index = cells.emitter_index
-        first = np.zeros(index.max(initial=0) + 1, dtype=np.uint32)
-        first[index[::-1]] = np.arange(len(index))[::-1]
-        self._cell_of = from_numpy(mi.UInt32, first)
+        self._cell_of = from_numpy(mi.UInt32, cells.first_cells())
 
     def begin(self, sampler, ray, pixel=None) -> mi.UInt32:
         return mi.UInt32(0)
@@ -84,7 +80,7 @@ class LightTable(EmitterSampling):
 
     def density(self, state, scene, ref, si, ds, active):
         # Few rays hit a light: the others skip the lookups
-        return _if(active, self._density, (state, ref, si, ds, active))
+        return if_active(active, self._density, (state, ref, si, ds, active))
 
     def probability(self, state, scene, ref, emitter, active):
         # Points and directions are cells of their own
@@ -121,7 +117,7 @@ def alias_rows(weights: mi.Float, rows: int, count: int) -> mi.Float:
     return table
 
 
-def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:
+def if_active(active: mi.Bool, function, arguments: tuple) -> mi.Float:
     """``function(*arguments)`` where ``active``, 0 elsewhere."""
     return dr.if_stmt(
         arguments, active, lambda *values: function(*values), lambda *_values: mi.Float(0)

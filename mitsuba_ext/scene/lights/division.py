@@ -38,6 +38,13 @@ _MAX_UNEVENNESS, _TEXTURE_SAMPLES = 1.5, 16
 #: The maximum number of cuts along each side of a triangle.
 _MAX_CUTS = 8
 
+#: Meshes of fewer faces are not divided into faces.
+_LEAST_FACES = 8
+
+#: The number of boxes, along the longest edge, in which the faces of a mesh become one cell if it
+#: has too many.
+_FACE_BOXES = 1024
+
 
 @dataclass
 class Division:
@@ -67,6 +74,11 @@ class Division:
     is_smooth: bool = False
     is_textured: bool = False
 
+    @property
+    def cell_of_piece(self) -> np.ndarray:
+        """The cell of each piece in the order of ``face_first``; shape [pieces]."""
+        return np.repeat(np.arange(len(self.cell_sizes)), self.cell_sizes)[self.face_pieces]
+
 
 #: Shapes whose cells are a grid in the unit square.
 _GRIDS = {"Rectangle": "rectangle", "Disk": "disk", "Cylinder": "cylinder"}
@@ -80,15 +92,32 @@ def emitter_shapes(scene: mi.Scene) -> list[mi.Shape | None]:
     return [shapes.get(emitter.ptr) for emitter in scene.emitters()]
 
 
-def divide(scene: mi.Scene, voxel: np.ndarray | None) -> list[Division]:
+def divide(
+    scene: mi.Scene, voxel: np.ndarray | None, face_cells: int = 0
+) -> list[Division]:
     """Divides the emitters into cells no larger than ``voxel``, given by its three edges (``None``
-    leaves emitters whole). The cells of a mesh also separate faces of different orientation."""
+    leaves emitters whole). The cells of a mesh also separate faces of different orientation.
+
+    Parameters:
+        face_cells: With this, emitters are whole except meshes without a texture: each of their
+            faces is a cell. Meshes that have more faces than this have about as many cells.
+    """
     emitters = scene.emitters()
+    if face_cells:
+        return [_divide_faces(*pair, face_cells) for pair in zip(emitters, emitter_shapes(scene))]
     limit = max(1, min(_MAX_CELLS, _CELL_BUDGET // max(1, len(emitters))))
     return [
         _divide(emitter, shape, voxel, limit)
         for emitter, shape in zip(emitters, emitter_shapes(scene))
     ]
+
+
+def _divide_faces(emitter: mi.Emitter, shape: mi.Shape | None, limit: int) -> Division:
+    is_textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    is_mesh = shape is not None and shape.is_mesh() and shape.face_count() >= _LEAST_FACES
+    if is_textured or not is_mesh or emitter.class_name() != "AreaLight":
+        return _divide(emitter, shape, None, 1)
+    return _divide_mesh(shape, None, limit, are_interpolated(shading_cosines(shape)), True)
 
 
 def _divide(
@@ -208,9 +237,10 @@ def _normalized(v: np.ndarray) -> np.ndarray:
 
 
 def _divide_mesh(
-    mesh: mi.Mesh, voxel: np.ndarray | None, limit: int, is_smooth: bool
+    mesh: mi.Mesh, voxel: np.ndarray | None, limit: int, is_smooth: bool, by_face: bool = False
 ) -> Division:
     """Cuts large faces, and groups pieces that are close together and face the same way.
+    ``by_face``: does not cut, and does not group up to ``limit`` faces.
 
     A mesh samples its faces by area, in order, with the second coordinate of the unit square. The
     first coordinate and the rescaled second one then sample a point of the triangle.
@@ -243,7 +273,12 @@ def _divide_mesh(
     if len(pieces) == 1 and not is_smooth:
         return Division(_WHOLE, np.ones(1, int))
     group = np.zeros(len(pieces), int)
-    group[has_area] = _groups(middle[has_area], normal[piece_face][has_area], voxel, limit)
+    if by_face and has_area.sum() <= limit:
+        group[has_area] = np.arange(has_area.sum())
+    else:
+        if by_face:
+            voxel = np.full(3, max(np.ptp(middle, axis=0).max() / _FACE_BOXES, 1e-30))
+        group[has_area] = _groups(middle[has_area], normal[piece_face][has_area], voxel, limit)
     order = np.argsort(group, kind="stable")
     face_pieces = np.empty(len(order), int)
     face_pieces[order] = np.arange(len(order))

@@ -21,6 +21,7 @@ class EmitterCells:
         indices: The scene indices of the emitters to divide; at least one.
         voxel: The three edges of a box. Longer emitters are divided; with ``None``, each emitter is
             one cell.
+        face_cells: Divides meshes into their faces (:func:`~.division.divide`).
 
     Attributes:
         count (int): Number of cells.
@@ -31,12 +32,18 @@ class EmitterCells:
             own sampling of such a mesh has a wrong density.
     """
 
-    def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        indices: list[int],
+        voxel: mi.Vector3f | None,
+        face_cells: int = 0,
+    ) -> None:
         # Kept alive: once an emitter's shape is freed, the next call to any scene's emitters
         # crashes
         self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
-        everything = divide(scene, edges)
+        everything = divide(scene, edges, face_cells)
         shapes = emitter_shapes(scene)
         divisions = [everything[i] for i in indices]
         sizes = np.concatenate([d.cell_sizes for d in divisions])
@@ -45,6 +52,7 @@ class EmitterCells:
         self.count = len(sizes)
         number = np.repeat(np.arange(len(indices)), cell_counts)
         self.emitter_index = np.array(indices)[number]
+        self._divisions = dict(zip(indices, divisions))
         measure = pieces[:, 2] * pieces[:, 3]
         ends = np.cumsum(sizes)
         self.share = np.add.reduceat(measure, ends - sizes)
@@ -84,6 +92,14 @@ class EmitterCells:
             cumulative[ends - 1] = 1
             self._cumulative = from_numpy(mi.Float, cumulative)
         self._inverse([shapes[i] for i in indices], divisions, cell_counts, sizes)
+
+    def faces(self, index: int, count: int) -> np.ndarray:
+        """The cell of each of the ``count`` faces of a mesh that is not cut, by the scene index of
+        its emitter."""
+        first, division = np.argmax(self.emitter_index == index), self._divisions[index]
+        if division.shape != "mesh":
+            return np.full(count, first)
+        return first + division.cell_of_piece
 
     def _inverse(
         self,
@@ -126,7 +142,7 @@ class EmitterCells:
         for d, f in meshes:
             cuts.append(np.sqrt(np.diff(d.face_first)).round().astype(np.uint32))
             first_entry.append(d.face_first[:-1] + entries)
-            cell_of.append(np.repeat(np.arange(len(d.cell_sizes)), d.cell_sizes)[d.face_pieces] + f)
+            cell_of.append(d.cell_of_piece + f)
             entries += d.face_first[-1]
         self._face_cuts = from_numpy(mi.UInt32, np.concatenate(cuts))
         self._face_first = from_numpy(mi.UInt32, np.concatenate(first_entry))

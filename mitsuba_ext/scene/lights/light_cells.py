@@ -24,6 +24,8 @@ class LightCells:
             into bins. With ``None``, each emitter is one cell.
         bins: The bins of the environment, if already made for other cells of this scene: making
             them takes a tenth of a second.
+        face_cells: Without ``voxel``: divides meshes into their faces, or about as many parts as
+            this if they have more (:func:`~.division.divide`).
 
     Attributes:
         count (int): Number of cells.
@@ -36,14 +38,20 @@ class LightCells:
     """
 
     def __init__(
-        self, scene: mi.Scene, voxel: mi.Vector3f | None, bins: EnvironmentBins | None = None
+        self,
+        scene: mi.Scene,
+        voxel: mi.Vector3f | None,
+        bins: EnvironmentBins | None = None,
+        face_cells: int = 0,
     ) -> None:
         environment = scene.environment() if voxel is not None else None
         emitters = scene.emitters()
         others = [
             i for i, e in enumerate(emitters) if environment is None or e.ptr != environment.ptr
         ]
-        self._emitters = EmitterCells(scene, others, voxel) if others else None
+        self._emitters = (
+            EmitterCells(scene, others, voxel, face_cells) if others else None
+        )
         self.bins = None if environment is None else bins or EnvironmentBins(scene)
         parts = [part for part in (self._emitters, self.bins) if part is not None]
         self.count = sum(part.count for part in parts)
@@ -57,6 +65,17 @@ class LightCells:
             self._first_bin -= self.bins.count
             index = next(i for i, e in enumerate(emitters) if e.ptr == environment.ptr)
             self.emitter_index[self._first_bin :] = index
+
+    def first_cells(self) -> np.ndarray:
+        """The first cell of each emitter, by its scene index."""
+        first = np.zeros(self.emitter_index.max(initial=0) + 1, dtype=np.uint32)
+        first[self.emitter_index[::-1]] = np.arange(self.count)[::-1]
+        return first
+
+    def faces(self, emitter: int, count: int) -> np.ndarray:
+        """The cell of each of the ``count`` faces of a mesh, by the scene index of its emitter; for
+        cells that are made with ``face_cells``."""
+        return self._emitters.faces(emitter, count)
 
     def tabulated(self) -> LightCells:
         """The same cells, for :meth:`sample` only, with a few fixed directions in each bin of an

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...scene.bounds import scene_bounds, shape_bounds
+from ...scene.bsdfs import is_in_table, opaque_bsdfs
 from ...scene.lights.division import emitter_shapes
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.weights import power_weights
@@ -24,9 +25,6 @@ _LEAST_COSINE = 0.02
 
 #: Rounding errors, relative to the largest coordinate of the scene.
 _ROUNDING = 4e-6
-
-#: BSDFs that perturb normals, as they appear in ``str(bsdf)``.
-_BUMPED = ("BumpMap[", "NormalMap[")
 
 
 @dataclass
@@ -74,7 +72,7 @@ class LinearChoice(EmitterSampling):
             return
         self.cells = LightCells(scene, None)
         if self.count > 1:
-            self._opaque = _opaque_bsdfs(scene)
+            self._opaque = opaque_bsdfs(scene)
             self._block = max(4, round(self.count**0.5))
             self._block_count = -(-self.count // self._block)
             self._tabulate(scene)
@@ -113,9 +111,7 @@ class LinearChoice(EmitterSampling):
         if self.count == 1:
             return None
         normal = dr.mulsign(si.sh_frame.n, si.wi.z)
-        bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
-        known = active & (bsdf < len(self._opaque))
-        is_opaque = known & dr.gather(mi.Bool, self._opaque, bsdf, known)
+        is_opaque = active & is_in_table(self._opaque, si.bsdf())
         total, sums = self._sums(si.p, normal, is_opaque, active)
         return Estimates(normal, is_opaque, total), sums
 
@@ -284,23 +280,3 @@ def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
         vertices = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
         return center, float(np.linalg.norm(vertices - center, axis=1).max(initial=0.0))
     return center, float(0.5 * np.linalg.norm(high - low))
-
-
-def _opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
-    """For each BSDF, by its number in Dr.Jit's registry: whether it reflects only light from the
-    side of the shading normal that is seen. False for BSDFs that are not found here (in
-    instances), and for bump and normal maps, whose normals may face away."""
-    transmission = int(mi.BSDFFlags.Transmission)
-    opaque = {}
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is not None and bsdf.ptr not in opaque:
-            text = str(bsdf)
-            id = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
-            opaque[bsdf.ptr] = id, not (
-                int(bsdf.flags()) & transmission or any(name in text for name in _BUMPED)
-            )
-    table = np.zeros(max((id for id, _ in opaque.values()), default=0) + 1, dtype=bool)
-    for id, is_opaque in opaque.values():
-        table[id] = is_opaque
-    return from_numpy(mi.Bool, table)

@@ -1,0 +1,207 @@
+"""What light cells look like from afar, for light trees."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...util.spectra import comparison_wavelengths
+from ..bounds import scene_bounds
+from ..movers import is_moving_light
+from .division import emitter_shapes, triangles
+from .light_cells import LightCells
+from .tree_construction import Lights
+
+#: Rounding errors, relative to the largest coordinate of the scene.
+_ROUNDING = 4e-6
+
+#: The distance of a directional light, and the radius of an environment, in radii of the scene.
+_FAR, _AROUND = 1e3, 10.0
+
+#: What a tree estimates for an environment of this radius and of strength 1, times the squared
+#: radius: the means of both cosines are what one estimates inside of a cluster.
+_INSIDE = 0.3
+
+
+def cell_bounds(scene: mi.Scene, cells: LightCells, power: np.ndarray) -> tuple[Lights, np.ndarray]:
+    """What the cells of a scene look like from afar. Directional lights are points far away,
+    and an environment is a sphere around the scene.
+
+    Parameters:
+        power: The power of each cell, in any unit; positive. For lights at infinity, the power that
+            enters the bounding sphere of the scene.
+
+    Returns:
+        The lights, in the order of the cells, and which of them are at infinity.
+    """
+    box = scene_bounds(scene)
+    has_extent = box.valid()
+    sphere = box.bounding_sphere() if has_extent else mi.ScalarBoundingSphere3f(0.0, 1.0)
+    bounds = _CellBounds(cells.count, np.array(sphere.center), float(sphere.radius) or 1.0, power)
+    shapes, emitters = emitter_shapes(scene), scene.emitters()
+    meshes = [i for i, s in enumerate(shapes) if s is not None and _is_flat(emitters[i], s)]
+    bounds.faces(
+        [shapes[i] for i in meshes], [cells.faces(i, shapes[i].face_count()) for i in meshes]
+    )
+    others = np.isin(cells.emitter_index, meshes, invert=True)
+    p, n, d = _samples(scene, sphere) if others.any() else (None,) * 3
+    for cell in np.flatnonzero(others):
+        i = cells.emitter_index[cell]
+        bounds.emitter(cell, emitters[i], shapes[i], p[i], n[i], d[i])
+    extent = float(np.abs([box.min, box.max]).max()) if has_extent else 1.0
+    return bounds.lights(_ROUNDING * extent), bounds.is_infinite
+
+
+def _is_flat(emitter: mi.Emitter, shape: mi.Shape) -> bool:
+    """Whether the light consists of triangles whose front sides are diffuse lights."""
+    return emitter.class_name() == "AreaLight" and shape.is_mesh() and shape.face_count() > 0
+
+
+def _samples(
+    scene: mi.Scene, sphere: mi.ScalarBoundingSphere3f
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, normal and direction of a direction sample of each emitter from the centre of the
+    scene; shape [emitters, 3] each."""
+    count = len(scene.emitters())
+    ref = dr.zeros(mi.Interaction3f, count)
+    ref.p, ref.wavelengths = mi.Point3f(sphere.center), comparison_wavelengths(count)
+    ds, _weight = scene.emitters_dr().sample_direction(ref, mi.Point2f(0.5), mi.Bool(True))
+    zero = dr.zeros(mi.Float, count)
+    return tuple(np.array(v + zero, dtype=np.float64).T for v in (ds.p, ds.n, ds.d))
+
+
+class _CellBounds:
+    """Collects what cells look like. By default, a cell lies somewhere in the scene and shines in
+    all directions."""
+
+    def __init__(self, count: int, center: np.ndarray, radius: float, power: np.ndarray) -> None:
+        self._scene_center, self._scene_radius = center.ravel(), radius
+        self.center = np.tile(self._scene_center, (count, 1))
+        self.spread, self.reach = np.full(count, 0.7 * radius), np.full(count, radius)
+        self.axis, self.angle = np.zeros((count, 3)), np.full(count, np.pi)
+        self.strength = np.array(power, dtype=np.float64)
+        self.is_infinite = np.zeros(count, bool)
+
+    def emitter(self, cell, emitter, shape, p, n, d) -> None:
+        """A whole emitter that is no mesh. ``p``, ``n``, ``d``: a direction sample."""
+        flags = emitter.flags()
+        is_beam = mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
+        if mi.has_flag(flags, mi.EmitterFlags.Infinite):
+            self._infinite(cell, d if is_beam else None)
+        elif is_moving_light(emitter):
+            self._box(cell, emitter.bbox())
+        elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+            self.center[cell], self.spread[cell], self.reach[cell] = p, 0.0, 0.0
+            if emitter.class_name() == "SpotLight":
+                self._spot(cell, emitter)
+        elif shape is not None:
+            self._shape(cell, emitter, shape, n)
+        elif emitter.bbox().valid():
+            self._box(cell, emitter.bbox())
+
+    def _infinite(self, cell: int, direction: np.ndarray | None) -> None:
+        self.is_infinite[cell] = True
+        radius = self._scene_radius
+        area = np.pi * radius**2
+        if direction is None:
+            # Irradiance of a surface in uniform light
+            irradiance = self.strength[cell] / (4 * area)
+            distance = self.spread[cell] = self.reach[cell] = _AROUND * radius
+            self.strength[cell] = irradiance * distance**2 / _INSIDE
+            return
+        distance = _FAR * radius
+        self.center[cell] = self._scene_center + distance * direction
+        self.spread[cell] = self.reach[cell] = radius
+        self.axis[cell], self.angle[cell] = -direction, 0.0
+        self.strength[cell] *= distance**2 / area
+
+    def _spot(self, cell: int, emitter: mi.Emitter) -> None:
+        values = mi.traverse(emitter)
+        cutoff, beam = (
+            np.radians(float(dr.slice(values[key]))) for key in ("cutoff_angle", "beam_width")
+        )
+        axis = np.array(emitter.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 2]
+        length = np.linalg.norm(axis)
+        if length > 0:
+            self.axis[cell], self.angle[cell] = axis / length, min(cutoff, np.pi)
+            # All light leaves in a cone
+            self.strength[cell] /= 2 * max(1 - np.cos(0.5 * (beam + cutoff)), 1e-6)
+
+    def _shape(self, cell: int, emitter: mi.Emitter, shape: mi.Shape, n: np.ndarray) -> None:
+        self._box(cell, shape.bbox())
+        kind = shape.class_name()
+        if kind == "Sphere":
+            radius = self.reach[cell] / np.sqrt(3)
+            self.spread[cell], self.reach[cell] = radius / np.sqrt(2), radius
+        if kind == "Disk" and emitter.class_name() == "AreaLight":
+            self.axis[cell], self.angle[cell] = n, 0.5 * np.pi
+
+    def _box(self, cell: int, box: mi.ScalarBoundingBox3f) -> None:
+        low, high = (np.array(x, dtype=np.float64).ravel() for x in (box.min, box.max))
+        self.center[cell] = 0.5 * (low + high)
+        self.reach[cell] = 0.5 * np.linalg.norm(high - low)
+        # A uniform distribution
+        self.spread[cell] = self.reach[cell] / np.sqrt(3)
+
+    def faces(self, meshes: list[mi.Shape], cells: list[np.ndarray]) -> None:
+        """Cells that consist of triangles. ``cells``: the cell of each face of each mesh."""
+        if not meshes:
+            return
+        a, b, c = (np.concatenate(x) for x in zip(*map(triangles, meshes)))
+        cell = np.concatenate(cells)
+        cross = np.cross(b - a, c - a)
+        area = np.linalg.norm(cross, axis=1)
+        middle = (a + b + c) / 3
+        corners = np.stack([a, b, c])
+        count = len(self.strength)
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            sums = [np.bincount(cell, area * x, count) for x in np.atleast_2d(values.T)]
+            return (np.array(sums) / np.maximum(total, 1e-300)).T
+
+        total = np.bincount(cell, area, count)
+        mine = total > 0
+        self.center[mine] = mean(middle)[mine]
+        from_center = np.linalg.norm(corners - self.center[cell], axis=2)
+        # Second moments of a triangle about its centre, and of its centre about the cell's
+        within = ((corners - middle) ** 2).sum(axis=(0, 2)) / 12
+        square = ((middle - self.center[cell]) ** 2).sum(axis=1) + within
+        self.spread[mine] = np.sqrt(mean(square)[:, 0])[mine]
+        self.reach[mine] = 0
+        np.maximum.at(self.reach, cell, from_center.max(axis=0))
+
+        # Light leaves on the side of the shading normals
+        normals = np.concatenate([_normals(mesh) for mesh in meshes], axis=1)
+        self.axis[mine] = mean(normals.mean(axis=0))[mine]
+        length = np.linalg.norm(self.axis, axis=1)
+        axis = self.axis / np.maximum(length, 1e-300)[:, None]
+        has_area = area > 0
+        cosine = (normals * axis[cell]).sum(axis=2).min(axis=0)[has_area]
+        angle = np.zeros(count)
+        np.maximum.at(angle, cell[has_area], np.arccos(np.clip(cosine, -1, 1)) + 0.5 * np.pi)
+        self.angle[mine] = np.where(length > 1e-3, np.minimum(angle, np.pi), np.pi)[mine]
+
+    def lights(self, rounding: float) -> Lights:
+        """The lights. ``rounding``: the error of coordinates."""
+        finite = ~self.is_infinite
+        self.reach[finite] += rounding
+        self.spread[finite] += rounding
+        strength = self.strength / max(self.strength.max(initial=0), 1e-300)
+        return Lights(
+            self.center, self.spread, self.reach, self.axis, self.angle,
+            np.maximum(strength, 1e-30),
+        )  # fmt: skip
+
+
+def _normals(mesh: mi.Mesh) -> np.ndarray:
+    """The unit normals at the three corners of each face; shape [3, faces, 3]."""
+    face = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    if mesh.has_vertex_normals() and not mesh.has_face_normals():
+        normals = np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)
+        normals = np.stack([normals[face[:, k]] for k in range(3)])
+    else:
+        a, b, c = triangles(mesh)
+        normals = np.stack([np.cross(b - a, c - a)] * 3)
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    return normals / np.maximum(length, 1e-300)

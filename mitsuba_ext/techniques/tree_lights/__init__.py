@@ -1,0 +1,1 @@
+"""Lights that are chosen by a light tree."""
