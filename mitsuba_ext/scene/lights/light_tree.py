@@ -1,12 +1,12 @@
 """A light tree: choosing a light by going down from the root at random.
 
-Each step takes a child with a probability proportional to an estimate of what its lights contribute
+Each step takes a child of a node with a probability proportional to an estimate of what its lights contribute
 to the vertex if nothing occludes them: their strength, times the cosines at the vertex and at the
 lights, divided by the squared distance. All three are means over the lights of the node, as far as
 their mean position, their spread and their mean normal tell them. (The bounds that the source uses
 have up to eight times the variance.) The estimate is 0 only where all lights of the node lie below
 the horizon of an opaque surface, or shine elsewhere, so a wrong estimate causes noise, but no bias.
-Where both children are dark, they are chosen by strength.
+Where all children are dark, they are chosen uniformly.
 
 Source: A. Conty Estevez, C. Kulla, *Importance Sampling of Many Lights with Adaptive Tree
 Splitting*, HPG 2018, section 5 (going down at random).
@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...util.arrays import from_numpy
-from .tree_construction import NODE_WORDS, Trees
+from .tree_construction import MOST_CHILDREN, NODE_WORDS, Trees
 
 #: The squared spread of lights, times this, is added to their squared distance: a mean of 1 / d².
 _SPREAD = 0.5
@@ -46,8 +46,8 @@ class Receiver:
 
 
 class LightTree:
-    """Chooses lights, and computes the probability of any light. For a vertex and one of n lights,
-    both visit about log₂ n pairs of nodes.
+    """Chooses lights, and computes the probability of any light. Both visit the children of as many
+    nodes as the tree has levels: the cost grows with the logarithm of the number of lights.
 
     Parameters:
         trees: The trees.
@@ -62,7 +62,9 @@ class LightTree:
             from_numpy(mi.UInt32, x) for x in (trees.link, trees.parent, trees.leaf)
         )
         # Each half of the way down takes its own random number, because one has only 24 bits
-        self._half = dr.opaque(mi.UInt32, (trees.depth + 1) // 2)
+        self._half, self._roots = (
+            dr.opaque(mi.UInt32, n) for n in ((trees.depth + 1) // 2, trees.roots)
+        )
 
     @dr.syntax
     def choose(
@@ -73,53 +75,58 @@ class LightTree:
         Returns:
             The light, and the probability of choosing it.
         """
-        normal, is_opaque = receiver.normal, receiver.is_opaque
         x, level, probability = mi.Float(numbers.x), mi.UInt32(0), mi.Float(1)
+        estimates = dr.alloc_local(mi.Float, MOST_CHILDREN)
         link = dr.gather(mi.UInt32, self._link, root, active)
         goes_down = active & (link & 1 == 0)
         while dr.hint(goes_down, label="light tree"):
             x = dr.select(level == self._half, numbers.y, x)
-            share = self._share(link, p, normal, is_opaque, goes_down)
-            is_first = x < share
-            chosen = dr.select(is_first, share, 1 - share)
-            x = dr.select(is_first, x, x - share) / chosen
-            x = dr.minimum(x, dr.one_minus_epsilon(mi.Float))
-            probability *= chosen
+            first, count = link >> 6, (link >> 1 & 31) + 1
+            total, estimates = self._estimates(first, count, p, receiver, estimates, goes_down)
+            child, share, x = _pick(count, total, estimates, x, goes_down)
+            probability *= share
             level += 1
-            link = dr.gather(mi.UInt32, self._link, link + dr.select(is_first, 0, 1), goes_down)
+            link = dr.gather(mi.UInt32, self._link, first + child, goes_down)
             goes_down &= link & 1 == 0
         return link >> 1, probability
 
     @dr.syntax
+    def _estimates(self, first, count, p, receiver, estimates, active):
+        """The estimates of siblings, and their sum."""
+        total, index = mi.Float(0), mi.UInt32(0)
+        while dr.hint(active & (index < count), label="estimates"):
+            estimate = self._estimate(first + index, p, receiver, active)
+            estimates.write(estimate, index, active)
+            total += estimate
+            index += 1
+        return total, estimates
+
+    @dr.syntax
     def probability(self, light: mi.UInt32, p: mi.Point3f, receiver: Receiver, active) -> mi.Float:
         """The probability with which :meth:`choose` chooses a light of its tree."""
-        normal, is_opaque = receiver.normal, receiver.is_opaque
         node = dr.gather(mi.UInt32, self._leaf, light, active)
-        parent = dr.gather(mi.UInt32, self._parent, node >> 1, active)
         probability = mi.Float(1)
-        while dr.hint(parent > 0, label="up the light tree"):
-            share = self._share(node & ~mi.UInt32(1), p, normal, is_opaque, active)
-            probability *= dr.select(node & 1 == 0, share, 1 - share)
+        while dr.hint(active & (node >= self._roots), label="up the light tree"):
+            parent = dr.gather(mi.UInt32, self._parent, node, active)
+            link = dr.gather(mi.UInt32, self._link, parent, active)
+            first, count = link >> 6, (link >> 1 & 31) + 1
+            # In the order of `choose`, for the same sum
+            total, mine, index = mi.Float(0), mi.Float(0), mi.UInt32(0)
+            while dr.hint(index < count, label="siblings"):
+                estimate = self._estimate(first + index, p, receiver, active)
+                total += estimate
+                mine = dr.select(first + index == node, estimate, mine)
+                index += 1
+            probability *= _share(mine, total, count)
             node = parent
-            parent = dr.gather(mi.UInt32, self._parent, node >> 1, active)
         return probability
 
-    def _share(self, first, p, normal, is_opaque, active) -> mi.Float:
-        """The probability of the first one of two siblings. Both functions above compute the
-        probability of the other one as 1 − share, so that they agree."""
-        shape = (2 * NODE_WORDS, dr.width(first))
-        w = dr.gather(mi.ArrayXf, self._nodes, first >> 1, active, shape=shape)
-        a, b = (
-            self._estimate(w[i : i + NODE_WORDS], p, normal, is_opaque)
-            for i in (0, NODE_WORDS)
-        )
-        # Strengths are positive
-        is_dark = a + b <= 0
-        a, b = dr.select(is_dark, w[7], a), dr.select(is_dark, w[15], b)
-        return a / dr.select(active, a + b, 1)
-
-    def _estimate(self, words, p, normal, is_opaque) -> mi.Float:
+    def _estimate(self, node, p, receiver, active) -> mi.Float:
         """What the lights of a node contribute to a vertex."""
+        words = dr.gather(
+            mi.ArrayXf, self._nodes, node, active, shape=(NODE_WORDS, dr.width(node))
+        )
+        normal, is_opaque = receiver.normal, receiver.is_opaque
         center, axis = mi.Point3f(words[:3]), mi.Vector3f(words[4:7])
         spread, strength = words[3], words[7]
         ratio, cos_limit = _last_bits(spread) / 255, _last_bits(strength) / 127.5 - 1
@@ -151,6 +158,37 @@ class LightTree:
         if self._largest is not None:
             G = dr.minimum(G, self._largest)
         return dr.select(is_lit, strength * G, 0)
+
+
+@dr.syntax
+def _pick(count, total, estimates, x, active) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """Picks one of ``count`` siblings by the uniform number ``x``.
+
+    Returns:
+        The sibling, the probability of picking it, and what is left of the random number.
+    """
+    target, child, before = x * total, mi.UInt32(0), mi.Float(0)
+    estimate = estimates.read(child, active)
+    # Only by rounding can the sum of all stay below the target: then the last one is picked
+    while dr.hint(
+        active & (before + estimate <= target) & (child + 1 < count), label="child"
+    ):
+        before += estimate
+        child += 1
+        estimate = estimates.read(child, active)
+    # Where all are dark
+    is_dark = total <= 0
+    slots = mi.Float(count)
+    slot = dr.minimum(mi.UInt32(x * slots), count - 1)
+    child = dr.select(is_dark, slot, child)
+    left = dr.select(is_dark, x * slots - mi.Float(slot), (target - before) / estimate)
+    left = dr.clip(dr.select(estimate > 0, left, 0.5), 0, dr.one_minus_epsilon(mi.Float))
+    return child, _share(estimate, total, count), left
+
+
+def _share(estimate, total, count) -> mi.Float:
+    """The probability of a sibling with this estimate; the same for all where all are dark."""
+    return dr.select(total > 0, estimate / total, dr.rcp(mi.Float(count)))
 
 
 def _last_bits(x: mi.Float) -> mi.Float:

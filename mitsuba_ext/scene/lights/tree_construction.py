@@ -1,9 +1,10 @@
-"""Builds light trees: binary trees over lights whose nodes know where their lights are, how far they
-are spread, and in which directions they shine.
+"""Builds light trees: trees over lights whose nodes know where their lights are, how far they are
+spread, and in which directions they shine.
 
-A node is divided in the middle of the longest edge of the box around its lights. The trees are
-built level by level, with operations on whole arrays. (Splits that minimise the surface area
-orientation heuristic of the source give estimates whose variance differs by less than a tenth.)
+The lights of a node are halved in the middle of the longest edge of the box around them, then each
+half again, four times in all: a node has up to 16 children. The trees are built level by level,
+with operations on whole arrays. (Splits that minimise the surface area orientation heuristic of the
+source give estimates whose variance differs by less than a tenth.)
 
 Source: A. Conty Estevez, C. Kulla, *Importance Sampling of Many Lights with Adaptive Tree
 Splitting*, HPG 2018, section 4 (bounds and cones).
@@ -18,9 +19,13 @@ import numpy as np
 #: Numbers of a node: centre and spread, axis and strength.
 NODE_WORDS = 8
 
-#: Below this level, nodes are divided into halves of equal numbers: lights whose distances range
-#: over many orders of magnitude would make deep trees.
-_MIDDLE_LEVELS = 32
+#: How often the lights of a node are halved, and the maximum number of its children.
+HALVINGS = 4
+MOST_CHILDREN = 1 << HALVINGS
+
+#: After so many halvings, all further halves have equal numbers of lights: lights whose distances
+#: range over many orders of magnitude would make deep trees.
+_MIDDLE_ROUNDS = 32
 
 #: Added to the angles of cones, for rounding.
 _ANGLE_MARGIN = 1e-3
@@ -61,15 +66,14 @@ class Lights:
 
 @dataclass
 class Trees:
-    """Binary trees over disjoint sets of lights. Siblings have the numbers 2k and 2k + 1; the roots
-    come first, and their even siblings are empty.
+    """Trees over disjoint sets of lights. The first nodes are the roots. Siblings are adjacent.
 
     Attributes:
         nodes: The words of each node (:func:`_packed`); shape [nodes, ``NODE_WORDS``].
-        link: The number of the first of a node's two children, which is even; of a leaf, 1 + twice
-            the number of its light.
-        parent: The parent of each pair of siblings; 0 for roots.
+        link: The children of each node (:func:`_links`).
+        parent: The parent of each node; 0 for roots.
         leaf: The node of each light; shape [lights].
+        roots: The number of sets.
         depth: The number of levels below the roots.
     """
 
@@ -77,6 +81,7 @@ class Trees:
     link: np.ndarray
     parent: np.ndarray
     leaf: np.ndarray
+    roots: int
     depth: int
 
 
@@ -87,43 +92,69 @@ def build_trees(
 
     Parameters:
         owner: The set of each light. By default, there is one.
-        sets: The number of sets. The tree of an empty set has one leaf, whose strength is 0.
+        sets: The number of sets. The tree of an empty set has one leaf, which is no light.
         apart: Lights to be separated from the others at the root.
     """
     count = len(lights)
     owner = np.zeros(count, int) if owner is None else owner
     order = np.argsort(owner, kind="stable")
     counts = np.bincount(owner, minlength=sets)
-    room = sets + max(0, count - np.count_nonzero(counts))
-    rows = np.zeros((2 * room, NODE_WORDS), np.float32)
-    link, parent = np.ones(2 * room, np.uint32), np.zeros(room, np.uint32)
+    nodes, links, parents = [], [], [np.zeros(sets, int)]
     leaf = np.zeros(count, np.uint32)
-    node = 2 * np.flatnonzero(counts) + 1
-    counts, pairs, depth = counts[counts > 0], sets, 0
-    while len(order):
+    known, depth = 0, 0
+    while True:
+        number = known + np.arange(len(counts))
+        known += len(counts)
         start = np.cumsum(counts) - counts
-        rows[node] = _packed(_summary(lights, order, start, counts))
-        is_leaf = counts == 1
-        light = order[start[is_leaf]]
-        link[node[is_leaf]], leaf[light] = 2 * light + 1, node[is_leaf]
-
-        # Divide the others
-        order = order[np.repeat(~is_leaf, counts)]
-        counts, node = counts[~is_leaf], node[~is_leaf]
+        exists = counts > 0
+        nodes.append(np.zeros((len(counts), NODE_WORDS), np.float32))
+        nodes[-1][exists] = _packed(_summary(lights, order, start[exists], counts[exists]))
+        is_inner = counts > 1
+        light = np.where(counts == 1, np.append(order, 0)[start], 0)
+        leaf[light[counts == 1]] = number[counts == 1]
+        order, counts = order[np.repeat(is_inner, counts)], counts[is_inner]
+        order, counts, parent = _divided(lights.center, order, counts, depth, apart)
+        children = np.bincount(parent, minlength=np.count_nonzero(is_inner))
+        first = known + np.cumsum(children) - children
+        links.append(2 * light + 1)
+        links[-1][is_inner] = _links(first, children)
         if len(counts) == 0:
             break
-        is_right = _division(lights.center[order], counts, depth < _MIDDLE_LEVELS)
-        if depth == 0 and apart is not None:
-            is_right = apart[order] if 0 < apart.sum() < count else is_right
+        parents.append(number[is_inner][parent])
+        depth += 1
+    words = (np.concatenate(x).astype(np.uint32) for x in (links, parents))
+    return Trees(np.concatenate(nodes), *words, leaf, sets, depth)
+
+
+def _links(first: np.ndarray, children: np.ndarray) -> np.ndarray:
+    """The words that describe the children of nodes: an even number, with the number of the first
+    child, and the count of children, less one, in five bits. (Leaves have an odd number: twice
+    their light, plus one.)"""
+    return first << 6 | (children - 1) << 1
+
+
+def _divided(
+    center: np.ndarray, order: np.ndarray, counts: np.ndarray, depth: int, apart: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Divides nodes into children, by halving them several times.
+
+    Returns:
+        The lights of the children, child by child; the number of lights of each child; and the
+        parent of each.
+    """
+    parent = np.arange(len(counts))
+    for halving in range(HALVINGS if len(counts) else 0):
         segment = np.repeat(np.arange(len(counts)), counts)
+        round_ = depth * HALVINGS + halving
+        is_right = _division(center[order], counts, round_ < _MIDDLE_ROUNDS)
+        if round_ == 0 and apart is not None and apart.any() and not apart.all():
+            is_right = apart[order]
         order = order[np.argsort(2 * segment + is_right, kind="stable")]
         right = np.bincount(segment, is_right, len(counts)).astype(int)
-        first = 2 * (pairs + np.arange(len(counts)))
-        link[node], parent[first // 2] = first, node
-        pairs, depth = pairs + len(counts), depth + 1
-        node = np.stack([first, first + 1], axis=1).ravel()
         counts = np.stack([counts - right, right], axis=1).ravel()
-    return Trees(rows, link, parent, leaf, depth)
+        exists = counts > 0
+        counts, parent = counts[exists], np.repeat(parent, 2)[exists]
+    return order, counts, parent
 
 
 def _division(center: np.ndarray, counts: np.ndarray, in_the_middle: bool) -> np.ndarray:

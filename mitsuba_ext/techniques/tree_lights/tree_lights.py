@@ -64,7 +64,7 @@ class TreeChoice(EmitterSampling):
 
     def sample(self, place, scene, numbers, si, active):
         light, probability = self._tree.choose(
-            mi.UInt32(1), numbers.choice, si.p, place, active
+            mi.UInt32(0), numbers.choice, si.p, place, active
         )
         cell = dr.gather(mi.UInt32, self._cell_of, light, active)
         ds, weight = self._cells.sample(cell, si, numbers.point, active)
