@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...util.spectra import comparison_wavelengths
 from ..bounds import scene_bounds
 from ..movers import is_moving_light
 from .division import emitter_shapes, triangles
@@ -45,10 +44,9 @@ def cell_bounds(scene: mi.Scene, cells: LightCells, power: np.ndarray) -> tuple[
         [shapes[i] for i in meshes], [cells.faces(i, shapes[i].face_count()) for i in meshes]
     )
     others = np.isin(cells.emitter_index, meshes, invert=True)
-    p, n, d = _samples(scene, sphere) if others.any() else (None,) * 3
     for cell in np.flatnonzero(others):
         i = cells.emitter_index[cell]
-        bounds.emitter(cell, emitters[i], shapes[i], p[i], n[i], d[i])
+        bounds.emitter(cell, emitters[i], shapes[i])
     extent = float(np.abs([box.min, box.max]).max()) if has_extent else 1.0
     return bounds.lights(_ROUNDING * extent), bounds.is_infinite
 
@@ -58,17 +56,14 @@ def _is_flat(emitter: mi.Emitter, shape: mi.Shape) -> bool:
     return emitter.class_name() == "AreaLight" and shape.is_mesh() and shape.face_count() > 0
 
 
-def _samples(
-    scene: mi.Scene, sphere: mi.ScalarBoundingSphere3f
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position, normal and direction of a direction sample of each emitter from the centre of the
-    scene; shape [emitters, 3] each."""
-    count = len(scene.emitters())
-    ref = dr.zeros(mi.Interaction3f, count)
-    ref.p, ref.wavelengths = mi.Point3f(sphere.center), comparison_wavelengths(count)
-    ds, _weight = scene.emitters_dr().sample_direction(ref, mi.Point2f(0.5), mi.Bool(True))
-    zero = dr.zeros(mi.Float, count)
-    return tuple(np.array(v + zero, dtype=np.float64).T for v in (ds.p, ds.n, ds.d))
+def _vector(v: mi.Vector3f) -> np.ndarray:
+    return np.array(v, dtype=np.float64).ravel()
+
+
+def _axis(emitter: mi.Emitter) -> np.ndarray:
+    """The direction in which an emitter shines: the z axis of its own space."""
+    axis = _vector(emitter.world_transform() @ mi.Vector3f(0, 0, 1))
+    return axis / max(np.linalg.norm(axis), 1e-300)
 
 
 class _CellBounds:
@@ -83,20 +78,23 @@ class _CellBounds:
         self.strength = np.array(power, dtype=np.float64)
         self.is_infinite = np.zeros(count, bool)
 
-    def emitter(self, cell, emitter, shape, p, n, d) -> None:
-        """A whole emitter that is no mesh. ``p``, ``n``, ``d``: a direction sample."""
+    def emitter(self, cell: int, emitter: mi.Emitter, shape: mi.Shape | None) -> None:
+        """A whole emitter that is no mesh."""
         flags = emitter.flags()
         is_beam = mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         if mi.has_flag(flags, mi.EmitterFlags.Infinite):
-            self._infinite(cell, d if is_beam else None)
+            self._infinite(cell, _axis(emitter) if is_beam else None)
         elif is_moving_light(emitter):
             self._box(cell, emitter.bbox())
         elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
-            self.center[cell], self.spread[cell], self.reach[cell] = p, 0.0, 0.0
+            self.center[cell] = _vector(emitter.world_transform() @ mi.Point3f(0))
+            if emitter.bbox().valid():
+                self.center[cell] = _vector(emitter.bbox().center())
+            self.spread[cell] = self.reach[cell] = 0
             if emitter.class_name() == "SpotLight":
                 self._spot(cell, emitter)
         elif shape is not None:
-            self._shape(cell, emitter, shape, n)
+            self._shape(cell, emitter, shape)
         elif emitter.bbox().valid():
             self._box(cell, emitter.bbox())
 
@@ -111,9 +109,9 @@ class _CellBounds:
             self.strength[cell] = irradiance * distance**2 / _INSIDE
             return
         distance = _FAR * radius
-        self.center[cell] = self._scene_center + distance * direction
+        self.center[cell] = self._scene_center - distance * direction
         self.spread[cell] = self.reach[cell] = radius
-        self.axis[cell], self.angle[cell] = -direction, 0.0
+        self.axis[cell], self.angle[cell] = direction, 0.0
         self.strength[cell] *= distance**2 / area
 
     def _spot(self, cell: int, emitter: mi.Emitter) -> None:
@@ -121,24 +119,22 @@ class _CellBounds:
         cutoff, beam = (
             np.radians(float(dr.slice(values[key]))) for key in ("cutoff_angle", "beam_width")
         )
-        axis = np.array(emitter.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 2]
-        length = np.linalg.norm(axis)
-        if length > 0:
-            self.axis[cell], self.angle[cell] = axis / length, min(cutoff, np.pi)
-            # All light leaves in a cone
-            self.strength[cell] /= 2 * max(1 - np.cos(0.5 * (beam + cutoff)), 1e-6)
+        self.axis[cell], self.angle[cell] = _axis(emitter), min(cutoff, np.pi)
+        # All light leaves in a cone
+        self.strength[cell] /= 2 * max(1 - np.cos(0.5 * (beam + cutoff)), 1e-6)
 
-    def _shape(self, cell: int, emitter: mi.Emitter, shape: mi.Shape, n: np.ndarray) -> None:
+    def _shape(self, cell: int, emitter: mi.Emitter, shape: mi.Shape) -> None:
         self._box(cell, shape.bbox())
         kind = shape.class_name()
         if kind == "Sphere":
             radius = self.reach[cell] / np.sqrt(3)
             self.spread[cell], self.reach[cell] = radius / np.sqrt(2), radius
         if kind == "Disk" and emitter.class_name() == "AreaLight":
-            self.axis[cell], self.angle[cell] = n, 0.5 * np.pi
+            ps = shape.sample_position(0.0, mi.Point2f(0.5))
+            self.axis[cell], self.angle[cell] = _vector(ps.n), 0.5 * np.pi
 
     def _box(self, cell: int, box: mi.ScalarBoundingBox3f) -> None:
-        low, high = (np.array(x, dtype=np.float64).ravel() for x in (box.min, box.max))
+        low, high = _vector(box.min), _vector(box.max)
         self.center[cell] = 0.5 * (low + high)
         self.reach[cell] = 0.5 * np.linalg.norm(high - low)
         # A uniform distribution

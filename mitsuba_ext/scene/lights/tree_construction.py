@@ -2,7 +2,7 @@
 spread, and in which directions they shine.
 
 The lights of a node are halved in the middle of the longest edge of the box around them, then each
-half again, four times in all: a node has up to 16 children. The trees are built level by level,
+half again, five times in all: a node has up to 32 children. The trees are built level by level,
 with operations on whole arrays. (Splits that minimise the surface area orientation heuristic of the
 source give estimates whose variance differs by less than a tenth.)
 
@@ -20,7 +20,7 @@ import numpy as np
 NODE_WORDS = 8
 
 #: How often the lights of a node are halved, and the maximum number of its children.
-HALVINGS = 4
+HALVINGS = 5
 MOST_CHILDREN = 1 << HALVINGS
 
 #: After so many halvings, all further halves have equal numbers of lights: lights whose distances
