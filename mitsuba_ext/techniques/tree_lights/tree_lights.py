@@ -38,7 +38,7 @@ class TreeChoice(EmitterSampling):
     choice_dimension = 2
 
     def __init__(self, scene: mi.Scene, cells: LightCells) -> None:
-        self._cells = cells
+        self.cells = cells
         weights = power_weights(scene, cells).numpy().astype(np.float64)
         chosen = np.flatnonzero(weights > 0)
         if len(chosen) == 0:
@@ -67,7 +67,7 @@ class TreeChoice(EmitterSampling):
             mi.UInt32(0), numbers.choice, si.p, place, active
         )
         cell = dr.gather(mi.UInt32, self._cell_of, light, active)
-        ds, weight = self._cells.sample(cell, si, numbers.point, active)
+        ds, weight = self.cells.sample(cell, si, numbers.point, active)
         ds.pdf *= probability
         weight = dr.select(probability > 0, weight / probability, 0)
         return ds, weight, Choice(mi.UInt32(0), cell, probability)
@@ -77,16 +77,16 @@ class TreeChoice(EmitterSampling):
         return if_active(active, self._density, (state, ref, si, ds, active))
 
     def _density(self, state, ref, si, ds, active) -> mi.Float:
-        cell, pdf = self._cells.pdf(ref, si, ds, active)
+        cell, pdf = self.cells.pdf(ref, si, ds, active)
         # Also where the lookups above were masked, the density must be a number
-        return dr.select(active, pdf * self._of_cell(cell, state, ref, active), 0)
+        return dr.select(active, pdf * self.of_cell(cell, state, ref, active), 0)
 
     def probability(self, state, scene, ref, emitter, active):
         # Points and directions are cells of their own
         cell = dr.gather(mi.UInt32, self._first_cell, emitter, active)
-        return self._of_cell(cell, state, ref, active)
+        return self.of_cell(cell, state, ref, active)
 
-    def _of_cell(self, cell, state, ref, active) -> mi.Float:
+    def of_cell(self, cell, state, ref, active) -> mi.Float:
         light = dr.gather(mi.UInt32, self._light_of, cell, active)
         exists = active & (light < self._count)
         probability = self._tree.probability(light, ref.p, state, exists)
