@@ -84,6 +84,15 @@ class Trees:
     roots: int
     depth: int
 
+    def padded(self, nodes: int, lights: int) -> Trees:
+        """The same trees, in arrays that have room for so many nodes and lights."""
+        arrays = (self.nodes, nodes), (self.link, nodes), (self.parent, nodes), (self.leaf, lights)
+        return Trees(*map(_padded, *zip(*arrays)), self.roots, self.depth)
+
+
+def _padded(array: np.ndarray, length: int) -> np.ndarray:
+    return np.pad(array, [(0, length - len(array)), *[(0, 0)] * (array.ndim - 1)])
+
 
 def build_trees(
     lights: Lights, owner: np.ndarray | None = None, sets: int = 1, apart: np.ndarray | None = None
