@@ -146,7 +146,7 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
             ["mirrors_and_glass"], ["llvm_ad_spectral"], ["furnace_glass"], [-1], _LEARNERS,
         ),
     ),
-    # Lights chosen by power, by distance, by a loop over all of them; nothing is learned
+    # Lights chosen by power, by distance, by a loop over all of them, by a tree: nothing is learned
     "power": Technique("composed_path", {"next_event": "power"}, checks=Checks(["rooms"])),
     "spatial": Technique(
         "composed_path", {"next_event": "spatial"}, checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS)
@@ -155,6 +155,14 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
         "composed_path", {"next_event": "linear"},
         checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
         thorough=Checks(cases=["thousand_lights"]),
+    ),
+    "tree": Technique(
+        "composed_path", {"next_event": "tree"},
+        checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
+        thorough=Checks(
+            ["many_lamps"], ["llvm_ad_spectral"], ["furnace_lamps"], [-1],
+            ("thousand_lights", "smooth_normal_lamp", "degenerate_light", "sun_of_one_texel"),
+        ),
     ),
     "resampled": Technique(
         "composed_path", {"next_event": "resampled"},

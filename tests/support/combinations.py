@@ -27,7 +27,7 @@ FACTORS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "next_event": {
         "uniform": {}, "power": {"next_event": "power"}, "spatial": {"next_event": "spatial"},
-        "linear": {"next_event": "linear"},
+        "linear": {"next_event": "linear"}, "tree": {"next_event": "tree"},
         "visibility": {"next_event": {"type": "learned_lights", "target": "visibility", "grid": 4}},
         "contribution": {"next_event": {"type": "learned_lights", "grid": 4}},
         "two_stage": {"next_event": {"type": "two_stage_lights", "splits": 4}},

@@ -63,6 +63,7 @@ REGRESSIONS = {
         Regression("composed_path", "sunny_gloss", max_depth=3),
         Regression("composed_path", "rooms", {"next_event": "spatial"}),
         Regression("composed_path", "rooms", {"next_event": "linear"}),
+        Regression("composed_path", "rooms", {"next_event": "tree"}),
         Regression("neepp", "door_ajar"),
         Regression("neepp", "rooms"),
         Regression("neepp", "rooms", {"light_sampling": "visibility"}, spp=256, is_slow=True),

@@ -76,7 +76,7 @@ def test_any_two_words_go_together_or_are_refused_in_a_sentence() -> None:
 def test_the_error_for_an_unknown_word_lists_the_known_words(slot: str, value: Any) -> None:
     message = _refusal(**{slot: value})
     words = {
-        "directions": "uniform, guided", "next_event": "power, spatial, linear",
+        "directions": "uniform, guided", "next_event": "power, spatial, linear, tree",
         "connections": "one", "mis": "balance, cutoff", "shadow_test": "visibility_roulette",
         "aperture": "sobol", "time": "sampler",
     }  # fmt: skip
