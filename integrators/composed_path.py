@@ -44,8 +44,9 @@ class ComposedPath(WalkIntegrator):
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
          (as :monosp:`path` chooses), :monosp:`power` (in proportion to the lights' power),
          :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
-         :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex,
-         at a cost that grows with the number of lights), :monosp:`resampled` (one of several
+         :monosp:`spatial_lights`, :monosp:`tree` (by a light tree: for many lights, and for meshes
+         that are lights), :monosp:`linear` (by an estimate for each light at each vertex, at a cost
+         that grows with the number of lights), :monosp:`resampled` (one of several
          candidates) or a nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the
          environment by the product of BSDF and light) or a nested :monosp:`two_stage_lights`,
          :monosp:`portals` (directions through the portals of a scene) or a nested
@@ -149,7 +150,7 @@ class ComposedPath(WalkIntegrator):
     homogeneous media along shadow rays is computed instead of estimated, which gives less noise;
     and :monosp:`hide_emitters` also hides a light that the camera sees through fog. In such scenes,
     :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
-    :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other choices need a
+    :monosp:`tree`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other choices need a
     surface and refuse the scene. A guide for :monosp:`directions` with regions of surfaces guides
     at surfaces only; a guide with tiles guides everywhere. As in :monosp:`volpath`, distances are
     sampled from the extinction of one colour channel. If the channels differ widely,
@@ -158,6 +159,14 @@ class ComposedPath(WalkIntegrator):
     :monosp:`ldsampler`, images of media have errors of 1 to 2 %, also with :monosp:`volpath`. A
     medium that exists only inside an :monosp:`instance` is rendered, but plugins that do not
     support media do not notice it, and therefore do not refuse the scene.
+
+    With :monosp:`next_event=tree`, a vertex goes down a tree over all lights, and takes a child of
+    a node with a probability proportional to an estimate of what the child's lights contribute:
+    power, distance, the normal of the surface, and where the lights shine. Nothing is learned and
+    the cost grows with the logarithm of the number of lights. Each face of a mesh of at least 8
+    faces is a light of its own, so that thousands of bulbs can be one mesh; textured meshes are
+    whole. The estimates know nothing of occlusion: use :monosp:`neepp` where most lights are hidden
+    and the render is long. With one light that is not such a mesh, it is :monosp:`uniform`.
 
     A scene file nests a decision as a :monosp:`sampler` with the name of the slot, because to
     Mitsuba, decisions are samplers. Every decision can be combined with every decision of the other
@@ -171,10 +180,11 @@ class ComposedPath(WalkIntegrator):
     Source: the algorithms of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T. Kajiya, *The
     Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling);
     P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section
-    3.4 (:monosp:`linear`); J. Hanika, M. Droske, L. Fascione, *Manifold Next Event Estimation*,
-    2015, and T. Zeltner, I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering
-    High-Frequency Caustics and Glints*, 2020 (:monosp:`caustics=manifold`). The pages of the
-    decisions name their own sources.
+    3.4 (:monosp:`linear`); A. Conty Estevez, C. Kulla, *Importance Sampling of Many Lights with
+    Adaptive Tree Splitting*, HPG 2018 (:monosp:`tree`); J. Hanika, M. Droske, L. Fascione,
+    *Manifold Next Event Estimation*, 2015, and T. Zeltner, I. Georgiev, W. Jakob, *Specular
+    Manifold Sampling for Rendering High-Frequency Caustics and Glints*, 2020
+    (:monosp:`caustics=manifold`). The pages of the decisions name their own sources.
 
     .. tabs::
         .. code-tab:: xml

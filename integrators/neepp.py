@@ -45,8 +45,8 @@ class NEEPlusPlus(WalkIntegrator):
        - |string|
        - How a light is chosen at each vertex, as with :monosp:`next_event` of
          :monosp:`composed_path`. Learned: :monosp:`contribution`, :monosp:`visibility`. Not
-         learned: :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`, :monosp:`linear`. (Default:
-         contribution)
+         learned: :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`, :monosp:`tree`,
+         :monosp:`linear`. (Default: contribution)
      * - rejection
        - |bool|
        - Whether to reject shadow rays by learned visibility. This saves time if

@@ -1,12 +1,12 @@
 """A light tree: choosing a light by going down from the root at random.
 
-Each step takes a child of a node with a probability proportional to an estimate of what its lights contribute
-to the vertex if nothing occludes them: their strength, times the cosines at the vertex and at the
-lights, divided by the squared distance. All three are means over the lights of the node, as far as
-their mean position, their spread and their mean normal tell them. (The bounds that the source uses
-have up to eight times the variance.) The estimate is 0 only where all lights of the node lie below
-the horizon of an opaque surface, or shine elsewhere, so a wrong estimate causes noise, but no bias.
-Where all children are dark, they are chosen uniformly.
+Each step takes a child of a node with a probability proportional to an estimate of what the child's
+lights contribute to the vertex if nothing occludes them: their strength, times the cosines at the
+vertex and at the lights, divided by the squared distance. The estimate is a mean over these lights,
+as far as their mean position, their spread and their mean normal tell it. (With the source's upper
+bounds in its place, unoccluded light has two to seven times the variance.) It is 0 only where all
+of the lights lie below the horizon of an opaque surface, or shine elsewhere: a wrong estimate
+causes noise, but no bias. Where all children are dark, they are chosen uniformly.
 
 Source: A. Conty Estevez, C. Kulla, *Importance Sampling of Many Lights with Adaptive Tree
 Splitting*, HPG 2018, section 5 (going down at random).
