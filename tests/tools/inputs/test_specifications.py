@@ -101,7 +101,8 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
         (
             "composed_path:next_event=learned_lights",
             "'learned_lights'; it must be one of uniform, power, spatial, linear, tree, "
-            "visibility, contribution, resampled, two_stage, triple_product, portals, or a nested plugin: "
+            "visibility, contribution, resampled, two_stage, triple_product, portals, or a nested "
+            "plugin: "
             '"spatial_lights" or "learned_lights" or "resampled_lights" or "two_stage_lights" or '
             '"portal_lights": nest the plugin (on the command line: next_event=[learned_lights])',
         ),
