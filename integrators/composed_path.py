@@ -152,8 +152,8 @@ class ComposedPath(WalkIntegrator):
     :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
     :monosp:`tree`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other
     choices need a surface and refuse the scene. A guide for :monosp:`directions` with regions of
-    surfaces guides at surfaces only; a guide with tiles guides everywhere. As in
-    :monosp:`volpath`, distances are sampled from the extinction of one colour channel. If the channels differ widely,
+    surfaces guides at surfaces only; a guide with tiles guides everywhere. As in :monosp:`volpath`,
+    distances are sampled from the extinction of one colour channel. If the channels differ widely,
     :monosp:`volpathmis` has less noise; a medium with no extinction at all in some channels is
     refused. Lights at infinity should not shine into an unbounded medium. With Mitsuba's
     :monosp:`ldsampler`, images of media have errors of 1 to 2 %, also with :monosp:`volpath`. A

@@ -8,7 +8,6 @@ import numpy as np
 
 from ...scene.bsdfs import is_in_table, opaque_bsdfs
 from ...scene.lights.cell_bounds import cell_bounds
-from ...scene.lights.choice import Choice
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.light_tree import LightTree, Receiver
 from ...scene.lights.tree_construction import build_trees
@@ -69,8 +68,7 @@ class TreeChoice(EmitterSampling):
         cell = dr.gather(mi.UInt32, self._cell_of, light, active)
         ds, weight = self.cells.sample(cell, si, numbers.point, active)
         ds.pdf *= probability
-        weight = dr.select(probability > 0, weight / probability, 0)
-        return ds, weight, Choice(mi.UInt32(0), cell, probability)
+        return ds, dr.select(probability > 0, weight / probability, 0), None
 
     def density(self, state, scene, ref, si, ds, active):
         # Few rays hit a light: the others skip the way up the tree
