@@ -1,10 +1,12 @@
 """Choices among lights in scenes on which nothing was tuned: streets, cells, bulbs, and few lights.
 
     python benchmarks/many_lights.py [SCENE …] [--choices path,power,spatial,linear,tree] [--spp 16]
+    python benchmarks/many_lights.py street --choices path,tree --picture FILE.jpg
 
 A scene is one of these, or the name of a file in scenes/. For each choice of lights, prints relMSE
 (the variance between seeds), the CPU time of a render, and the efficiency relative to the first
-choice: of all pixels, and without the largest 0.1 % of the errors. The choices take turns.
+choice: of all pixels, and without the largest 0.1 % of the errors. The choices take turns. A
+picture has a render of each choice, side by side.
 """
 
 from __future__ import annotations
@@ -238,20 +240,39 @@ HOLD_OUTS = {
 }  # fmt: skip
 
 
-def measure(name: str, choices: list[str], spp: int, rounds: int) -> None:
-    """Renders a scene with each choice, and prints a row for each."""
-    if name in HOLD_OUTS:
-        scene = mi.load_dict(HOLD_OUTS[name]())
-    else:
-        file = str(SCENES / f"{name}.xml")
-        scene = mi.load_file(file, width=SIZE[0], height=SIZE[1])
-    integrators = {
+def _load(name: str, width: int, height: int) -> mi.Scene:
+    if name not in HOLD_OUTS:
+        return mi.load_file(str(SCENES / f"{name}.xml"), width=width, height=height)
+    scene = HOLD_OUTS[name]()
+    scene["sensor"]["film"] |= {"width": width, "height": height}
+    return mi.load_dict(scene)
+
+
+def _integrators(choices: list[str]) -> dict[str, mi.Integrator]:
+    return {
         choice: mi.load_dict(
             {"type": choice, "max_depth": 6} if choice in ("path", "neepp", "auto_path", "auto")
             else {"type": "composed_path", "max_depth": 6, "next_event": choice}
         )
         for choice in choices
     }  # fmt: skip
+
+
+def draw(name: str, choices: list[str], spp: int, file: str) -> None:
+    """Writes a picture of renders with each choice, side by side."""
+    scene = _load(name, 400, 225)
+    images = [
+        np.array(mi.render(scene, integrator=each, spp=spp, seed=1))
+        for each in _integrators(choices).values()
+    ]
+    white = np.quantile(np.mean(images, axis=0), 0.95)
+    bitmap = mi.Bitmap(np.concatenate(images, axis=1).astype(np.float32) * (0.8 / white))
+    bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True).write(file, quality=80)
+
+
+def measure(name: str, choices: list[str], spp: int, rounds: int) -> None:
+    """Renders a scene with each choice, and prints a row for each."""
+    scene, integrators = _load(name, *SIZE), _integrators(choices)
     images, times = ({choice: [] for choice in choices} for _ in range(2))
     for round_ in range(-1, rounds):
         for place, choice in enumerate(choices if round_ % 2 else choices[::-1]):
@@ -284,9 +305,13 @@ def main() -> None:
     parser.add_argument("--choices", default="path,power,spatial,linear,tree")
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--picture", metavar="FILE")
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     for name in arguments.scenes:
+        if arguments.picture:
+            draw(name, arguments.choices.split(","), arguments.spp, arguments.picture)
+            continue
         measure(name, arguments.choices.split(","), arguments.spp, arguments.rounds)
 
 

@@ -4,8 +4,8 @@ spread, and in which directions they shine.
 The lights of a node are halved in the middle of the longest edge of the box around them, then each
 half again, five times in all: a node has up to 32 children. The trees are built level by level,
 with operations on whole arrays. (Splits that minimise the surface area orientation heuristic of the
-source change the variance of the choices by a tenth at most in most of eight arrangements of
-lights.)
+source have a seventh less variance in one of seven arrangements of lights, and as much or more in
+five.)
 
 Source: A. Conty Estevez, C. Kulla, *Importance Sampling of Many Lights with Adaptive Tree
 Splitting*, HPG 2018, section 4 (bounds and cones).
