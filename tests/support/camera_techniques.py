@@ -160,7 +160,7 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
         "composed_path", {"next_event": "tree"},
         checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
         thorough=Checks(
-            ["many_lamps"], ["llvm_ad_spectral"], ["furnace_lamps"], [-1],
+            ["mirrors_and_glass"], ["llvm_ad_spectral"], ["furnace_lamps"], [-1],
             ("thousand_lights", "smooth_normal_lamp", "degenerate_light", "sun_of_one_texel"),
         ),
     ),
