@@ -105,6 +105,7 @@ def auto_path(
     keep_learned: bool = False,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -129,6 +130,8 @@ def auto_path(
             (frames, notebooks). (Default: false)
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
+        caustics (string): Whether paths also connect to lights through smooth glass and mirrors
+            (manifold), as in composed_path. (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -213,6 +216,7 @@ def composed_path(
     connections: str | int | Plugin = "one",
     mis: str | Plugin = "power",
     shadow_test: str | Plugin = "always",
+    caustics: str = "scattered",
     aperture: str | Plugin = "sampler",
     time: str | Plugin = "sampler",
     wavelength: str | Plugin = "sampler",
@@ -262,6 +266,8 @@ def composed_path(
         shadow_test (string or decision): Whether the shadow ray of a connection is traced: always,
             by visibility_roulette (learned), or by a nested visibility_roulette with parameters.
             (Default: always)
+        caustics (string): How paths find light that smooth glass, water or mirrors lead to a
+            vertex. (Default: scattered)
         aperture, time, wavelength (string or decision): Which random numbers choose the point on
             the aperture, the time, and the wavelengths of a camera ray. (Default: sampler)
         distance (string): Which random numbers choose the distance that a camera ray travels in a
@@ -676,6 +682,7 @@ def neepp(
     refine: int = 16,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -713,6 +720,8 @@ def neepp(
             random visibility tests of visibility_roulette. (Default: 16)
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
+        caustics (string): Whether paths also connect to lights through smooth glass and mirrors
+            (manifold), as in composed_path. (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -796,6 +805,7 @@ def pss_guided(
     max_memory: float = 512,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -830,6 +840,8 @@ def pss_guided(
         max_memory (float): Memory for what is recorded and learned, in MiB. (Default: 512)
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
+        caustics (string): Whether paths also connect to lights through smooth glass and mirrors
+            (manifold), as in composed_path. (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1113,6 +1125,7 @@ def swarm_path(
     keep_learned: bool = False,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -1154,6 +1167,8 @@ def swarm_path(
             (frames, notebooks). (Default: false)
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
+        caustics (string): Whether paths also connect to lights through smooth glass and mirrors
+            (manifold), as in composed_path. (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1181,6 +1196,7 @@ def two_stage(
     keep_learned: bool = False,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -1215,6 +1231,8 @@ def two_stage(
         keep_learned (bool): With visibility maps: as in composed_path. (Default: false)
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
+        caustics (string): Whether paths also connect to lights through smooth glass and mirrors
+            (manifold), as in composed_path. (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
