@@ -145,6 +145,11 @@ class Variance(mi.AdjointIntegrator):
         if isinstance(children[0], type(self)):
             raise ValueError(f'"{self.name}": cannot be nested in another "{self.name}"')
         refuse_checkpoint(self.name, children[0])
+        if getattr(children[0], "masks", ()):
+            raise ValueError(
+                f'"{self.name}": the masks in the parameter "aovs" of the nested integrator are '
+                f"not mean values, and have no variance: leave them out here"
+            )
         taken = {_PREFIX + color for color in "RGBXYZ"} & set(children[0].aov_names())
         if taken:
             raise ValueError(

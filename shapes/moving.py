@@ -143,8 +143,11 @@ class Moving(mi.Mesh):
         """The nested shapes alone, in the frame in which they rest."""
         if self._at_rest is None:
             shapes = {f"shape_{i}": child for i, child in enumerate(self.children)}
+            names = [child.id() for child in self.children]
             try:
                 self._at_rest = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+                for child, name in zip(self.children, names):
+                    child.set_id(name)  # which Mitsuba replaces by the key
             except RuntimeError as error:
                 if not any(child.class_name() == "Instance" for child in self.children):
                     raise

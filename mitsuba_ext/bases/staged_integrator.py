@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
+from ..images.coverage import Coverage, channel_names
 from ..long_renders.intervals import Interval
 from ..rendering import camera
 from ..rendering import render as rendering
@@ -69,11 +71,16 @@ class StagedIntegrator(mi.SamplingIntegrator):
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
         watch: Is shown the unfinished image after some of the passes
             (:class:`~mitsuba_ext.rendering.request.Watch`); ``None`` if nobody watches.
+        masks: The names and types of the masks that it renders; none by default.
+        coverage: What covers each pixel, after a render with masks
+            (:class:`~mitsuba_ext.images.coverage.Coverage`).
         statistics: The statistics of the last render
             (:class:`~mitsuba_ext.rendering.statistics.RenderStatistics`).
     """
 
     sees_all = True
+    masks: tuple[tuple[str, str], ...] = ()
+    coverage: Coverage | None = None
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
@@ -178,7 +185,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
             with in_turn(self, sensor):
                 return self.render_once(request)
         with in_turn(self, sensor, self._forget_cancel):
-            return self._render_kept(request) if self.checkpoint else self.render_once(request)
+            image = self._render_kept(request) if self.checkpoint else self.render_once(request)
+        return self.with_masks(image) if develop else image
 
     def render_once(self, request: Request) -> mi.TensorXf:
         """Renders the whole image, or one batch of a checkpointed render."""
@@ -187,6 +195,22 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names; none by default."""
         return []
+
+    def prepare_aovs(self, scene: mi.Scene) -> None:
+        """Prepares :meth:`sample_aovs` for a scene."""
+
+    def mask_names(self) -> list[str]:
+        """The channels of the masks. They follow the channels of :meth:`aov_names` in the image
+        that :meth:`render` returns. The film does not hold them, because a film adds up samples."""
+        return channel_names(self.masks)
+
+    def with_masks(self, image: mi.TensorXf) -> mi.TensorXf:
+        """The image that the film develops, with the channels of the masks of the last render."""
+        if not self.masks or self.coverage is None:
+            return image
+        planes = self.coverage.channels(self.masks).values()
+        pixels = np.concatenate([image.numpy(), np.stack([*planes], axis=2)], axis=2)
+        return mi.TensorXf(pixels)
 
     def cancel(self) -> None:
         """Ends the running render after the current pass (call it from ``progress`` or from another
@@ -239,6 +263,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
             dict(totals.kernels),
         )  # fmt: skip
         image = camera.develop(sensor.film(), request.develop, request.evaluate)
+        self.coverage = state.coverage
         if is_interrupted:
             raise interrupted(self.name)
         return image

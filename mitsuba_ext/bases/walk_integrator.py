@@ -25,8 +25,9 @@ from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
-from ..scene.aovs import check_aovs
+from ..scene.aovs import AOV_TYPES, MASK_TYPES, check_aovs, split_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
+from ..scene.surface_names import SurfaceNames, surface_names
 from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
@@ -73,7 +74,9 @@ class WalkIntegrator(StagedIntegrator):
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+         :monosp:`depth:depth,nn:sh_normal`, and masks: the types :monosp:`object_id`,
+         :monosp:`material_id`, :monosp:`cryptomatte_object` and :monosp:`cryptomatte_material`.
+         (Default: none)
 
     Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
     ``keep_learned``; see :class:`composed_path`.
@@ -98,7 +101,15 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.clamps = self._read_clamps(props, read)
         self.aovs = read("aovs", "")
-        self._aovs = self._aov_integrator(self.aovs)
+        check_aovs(self.name, self.aovs, (*AOV_TYPES, *MASK_TYPES))
+        items = split_aovs(self.aovs)
+        self.masks = tuple(item for item in items if item[1] in MASK_TYPES)
+        self._variables = ",".join(":".join(item) for item in items if item not in self.masks)
+        self._numbers_shapes = any(kind == "shape_index" for _name, kind in items)
+        self._names: SurfaceNames | None = None
+        self._aovs = None
+        if self._variables:
+            self._aovs = mi.load_dict({"type": "aov", "aovs": self._variables})
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -346,6 +357,13 @@ class WalkIntegrator(StagedIntegrator):
                 f'"variance" can hold it, and it has a parameter "aovs" of its own'
             )
         self.check_sampled()
+        if self.masks:
+            raise NotImplementedError(
+                f'"{self.name}": the masks in "aovs" ({", ".join(kind for _, kind in self.masks)}) '
+                f"are made from all samples of a pixel: render with this integrator itself, and "
+                f"not in one that asks for single samples"
+            )
+        self.prepare_aovs(scene)
         setting = Setting(
             scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
         )
@@ -356,12 +374,17 @@ class WalkIntegrator(StagedIntegrator):
     def aov_names(self) -> list[str]:
         return self._aovs.aov_names() if self._aovs else []
 
+    def prepare_aovs(self, scene: mi.Scene) -> None:
+        self._names = surface_names(scene) if self._numbers_shapes else None
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
-        if has_unseen_shapes(scene):
-            return output_variables(self._aovs, self.aovs, scene, sampler, ray)
+        if has_unseen_shapes(scene) or self._numbers_shapes:
+            return output_variables(
+                self._aovs, self._variables, scene, sampler, ray, self._names
+            )
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
@@ -413,7 +436,3 @@ class WalkIntegrator(StagedIntegrator):
                 refuse_media(scene, what, f'choose another one, such as "{default}"')
         refuse_moving_grids(scene, f'"{self.name}"')
         refuse_missing_colours(scene, f'"{self.name}"')
-
-    def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
-        check_aovs(self.name, aovs)
-        return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None

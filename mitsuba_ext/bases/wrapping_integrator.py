@@ -109,6 +109,14 @@ class WrappingIntegrator(StagedIntegrator):
     def aov_names(self) -> list[str]:
         return self.nested.aov_names()
 
+    @property
+    def masks(self) -> tuple[tuple[str, str], ...]:
+        return self.nested.masks if self._is_staged else ()
+
+    def prepare_aovs(self, scene: mi.Scene) -> None:
+        if self._is_staged:
+            self.nested.prepare_aovs(scene)
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []
 

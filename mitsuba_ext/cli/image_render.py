@@ -121,9 +121,12 @@ def render_image(
     def write(
         target: Path, others: Mapping[str, np.ndarray] | None = None, is_final: bool = True
     ) -> None:
-        layers = {**job.variance(), **(others or {})}
+        layers, about = {**job.variance(), **(others or {})}, metadata()
+        if job.coverage is not None:
+            layers.update(job.coverage.channels(job.integrator.masks))
+            about.update(job.coverage.metadata(job.integrator.masks))
         # The render waits while an unfinished image is written, so do not compress it
-        image_files.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
+        image_files.write_film(target, job.film, about, layers, is_compressed=is_final)
 
     def show(is_asked: bool) -> None:
         if is_asked or (long and long.folder):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..images.coverage import Coverage
 from ..inputs.chosen import LastScene
 from ..live.kept_folder import of_state
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
@@ -242,6 +243,11 @@ class LongJob:
         colours = [name for name in batches.channels[: batches.image_channel_count] if name != "A"]
         variance = batches.variance
         return {f"variance.{name}": variance[..., n] for n, name in enumerate(colours)}
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """What covers each pixel, if the integrator has masks."""
+        return self._state.coverage
 
     def about(self) -> Mapping[str, Any]:
         """Further metadata of the image."""

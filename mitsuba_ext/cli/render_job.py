@@ -11,6 +11,7 @@ import numpy as np
 from rich.progress import Progress
 
 from ..compare import timing
+from ..images.coverage import Coverage
 from ..inputs.chosen import Chosen
 from ..rendering.batches import sample_count
 from ..rendering.plan import is_independent
@@ -153,6 +154,11 @@ class RenderJob:
     def variance(self) -> dict[str, np.ndarray]:
         """The channels with the variance of the image: none, because it is unknown."""
         return {}
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """What covers each pixel, if the integrator has masks."""
+        return getattr(self.integrator, "coverage", None)
 
     def about(self) -> dict[str, Any]:
         """Further metadata of the image: none."""

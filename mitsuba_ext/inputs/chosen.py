@@ -17,7 +17,7 @@ from .scene_changes import UNCHANGED, SceneChanges
 from .scene_remarks import scene_remarks
 from .scene_values import SceneValues
 from .scenes import LoadedScene, load_scene
-from .specifications import NamedIntegrator, make_named
+from .specifications import NamedIntegrator, make_named, names_masks
 
 #: The integrator for scenes that specify ``path`` or none, if the user names none.
 DEFAULT = "auto"
@@ -114,13 +114,14 @@ class LastScene:
         """
         is_own, has_values = specification in (None, OF_SCENE), values is not None
         items = tuple(definitions.items())
-        key = (mi.variant(), path, size, items, is_own, has_values, changes)
+        keeps_names = has_values or names_masks(specification)
+        key = (mi.variant(), path, size, items, is_own, keeps_names, changes)
         if key != self._key:
             # Free the last scene first, because Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
             gc.collect()  # the object that mi.traverse returns refers to itself
             self._loaded = load_scene(
-                path, size, definitions, is_own, has_values, moved, changes
+                path, size, definitions, is_own, keeps_names, moved, changes
             )
             self._values = SceneValues(self._loaded.scene) if has_values else None
             self._key = key

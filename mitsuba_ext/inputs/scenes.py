@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..scene.aovs import check_nodes
+from ..scene.aovs import check_nodes, has_masks
 from ..util.errors import InputError, did_you_mean, one_line
 from ..util.files import is_utf8, printable
 from .content_hash import hash_each, hash_files
@@ -153,7 +153,8 @@ def load_scene(
         keep_integrator: ``False`` drops the scene's integrator, so that a scene whose integrator is
             not installed can be rendered with another one.
         keep_names: Whether to keep the file's objects for ``mi.traverse``. By default, Mitsuba
-            merges meshes of the same material, and equal materials.
+            merges meshes of the same material, and equal materials, except where the scene's
+            integrator has masks.
         moved: A function that maps the old absolute path of a file to its present path and returns
             all other texts unchanged.
         changes: Other changes to the scene.
@@ -199,6 +200,8 @@ def load_scene(
             settings, only_says_path = _settings(integrator), _only_says_path(state)
             if changes.max_depth is not None:
                 settings[SETTINGS[0]] = changes.max_depth
+            if keep_integrator and has_masks(state):
+                config.merge_meshes = config.merge_equivalent = False
             names_media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
             if not keep_integrator:
                 _drop_integrators(state)

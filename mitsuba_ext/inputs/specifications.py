@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import uuid
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
 from xml.etree import ElementTree
 
-from ..scene.aovs import check_aovs, check_nodes
+from ..scene.aovs import MASK_TYPES, check_aovs, check_nodes
 from ..startup.plugin_parameters import parameter_names
 from ..startup.registry import plugin_names
 from ..util.errors import InputError, one_line
@@ -141,6 +142,17 @@ def _is_alive(specification: object) -> bool:
     if isinstance(specification, Mapping):
         return any(map(_is_alive, specification.values()))
     return isinstance(specification, mi.Object)
+
+
+def names_masks(specification: str | None) -> bool:
+    """Whether the text of an integrator, or its file, may name a mask."""
+    if not specification:
+        return False
+    file, text = Path(specification), specification
+    if file.suffix.lower() in (".xml", ".json"):
+        with contextlib.suppress(OSError, ValueError):
+            text = file.read_text(encoding="utf-8")
+    return any(f":{kind}" in text for kind in MASK_TYPES)
 
 
 def is_fragment(path: Path) -> bool:

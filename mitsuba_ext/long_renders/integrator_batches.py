@@ -113,6 +113,9 @@ class IntegratorBatches:
         """
         size, found = image_shape(self.sensor.film()), result.image.shape
         shapes = {found[:2], result.contents.shape[:2]}
+        has_masks = bool(getattr(self._integrator, "masks", ()))
+        if has_masks != (result.coverage is not None):
+            raise InputError("a worker returned no masks: does it run the same version?")
         if shapes != {size} or found[2:] != (len(result.channels),) or result.batch.spp < 1:
             raise InputError(
                 f"a worker returned an image of shape {found}, instead of one of {size[1]}x"
@@ -139,5 +142,5 @@ class IntegratorBatches:
         return BatchResult(
             batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
             images.mean.astype(np.float32), images.channels, images.image_channel_count,
-            tuple(integrator.aov_names()), totals,
+            tuple(integrator.aov_names()), totals, coverage=getattr(integrator, "coverage", None),
         )  # fmt: skip

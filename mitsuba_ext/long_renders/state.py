@@ -8,6 +8,7 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from ..images.coverage import Coverage
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
 from ..rendering.totals import RenderTotals
@@ -41,6 +42,7 @@ class BatchResult(NamedTuple):
         learned: The file that the integrator's ``save_learned`` writes, for the other batches;
             empty if there was nothing to learn, ``None`` if the batch did not have to learn.
         totals: The cost of the batch.
+        coverage: What covers each pixel, if the integrator has masks.
     """
 
     batch: Batch
@@ -52,6 +54,7 @@ class BatchResult(NamedTuple):
     aov_names: tuple[str, ...]
     totals: RenderTotals
     learned: bytes | None = None
+    coverage: Coverage | None = None
 
 
 def image_shape(film: mi.Film) -> tuple[int, int]:
@@ -70,6 +73,7 @@ class RenderState:
         aov_names: The channels besides the image's.
         learned: The state that a batch learned for the others, as in :class:`BatchResult`.
         totals: The total cost of the batches.
+        coverage: What covers each pixel, if the integrator has masks.
     """
 
     def __init__(self) -> None:
@@ -78,6 +82,7 @@ class RenderState:
         self.totals = RenderTotals()
         self.film, self.images = FilmSums(), None
         self.aov_names: tuple[str, ...] = ()
+        self.coverage: Coverage | None = None
 
     @property
     def spp(self) -> int:
@@ -103,6 +108,7 @@ class RenderState:
         film.spp = result.batch.spp
         self.film = self.film.plus(film)
         self.images, self.aov_names = images, result.aov_names
+        self.coverage = _both(self.coverage, result.coverage)
         self.done.append(result.batch)
         if result.learned is not None:
             self.learned = result.learned
@@ -129,6 +135,7 @@ class RenderState:
         total.done = [*self.done, *other.done]
         total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)
         total.aov_names = self.aov_names
+        total.coverage = _both(self.coverage, other.coverage)
         total.totals = self.totals.plus(other.totals)
         return total
 
@@ -156,7 +163,9 @@ class RenderState:
         learned = {}
         if self.learned is not None:
             learned["learned"] = np.frombuffer(self.learned, dtype=np.uint8)
+        coverage = self.coverage.arrays() if self.coverage else {}
         return {
+            **{f"coverage.{name}": array for name, array in coverage.items()},
             **{f"images.{name}": array for name, array in images.items()},
             **learned,
             "done": np.array(self.done, dtype=np.uint32).reshape(-1, 3),
@@ -199,4 +208,13 @@ class RenderState:
         state.film.contents = arrays.take("contents", "f", shape, *anything, most_bytes)
         state.film.has_weights = bool(arrays.take("has_weights", "b"))
         state.film.spp = spp
+        if "coverage.size" in arrays:
+            state.coverage = Coverage.from_arrays(arrays.part("coverage."), most_bytes)
+            is_same = state.coverage.size == (shape[1], shape[0])
+            arrays.require(is_same, f"masks of the size {state.coverage.size}")
         return state
+
+
+def _both(first: Coverage | None, second: Coverage | None) -> Coverage | None:
+    """The sum of what there is."""
+    return first.plus(second) if first and second else first or second

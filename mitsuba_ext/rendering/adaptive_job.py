@@ -136,7 +136,7 @@ class AdaptiveJob(Job):
         sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
         brightness = channel_mean(sample.L * (rays.importance * rays.weight))
         brightness += dr.zeros(mi.Float, size)  # of one lane where all samples are equal
-        dr.eval(brightness, self.block.tensor(), self.tally)
+        self._evaluate(brightness)
         dr.sync_thread()
         self.moments.add(pixels, brightness)
         self.statistics.passes += 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +26,7 @@ from .device import device_of, look_again
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt, interrupted
+from .mask_samples import MaskSamples
 from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
@@ -76,6 +78,8 @@ def render(integrator: Staged, request: Request, job: type[Job] | None = None) -
         with dr.suspend_grad():
             made, interrupt = with_recordings(scene, sensor, attempt)
     image = camera.develop(sensor.film(), request.develop, request.evaluate)
+    if made.masks is not None:
+        integrator.coverage = made.masks.coverage()
     made.finish()
     if interrupt.is_set():
         raise interrupted(integrator.name)
@@ -112,6 +116,12 @@ class Job:
                 f'channels ("aovs", "count_samples"): use an "hdrfilm".'
             )
         self.film.prepare(aovs)
+        integrator.prepare_aovs(self.scene)
+        self.masks = None
+        if integrator.masks:
+            self.masks = MaskSamples(
+                integrator.name, self.scene, self.film, integrator.masks, integrator.hide_emitters
+            )
         # A single part has no range, so that kernels need not add its first pixel
         self.parts = [None] if self.plan.parts == 1 else self.plan.pixels
         # Structured samplers, one for each part of the film, which keep their state between passes
@@ -199,6 +209,8 @@ class Job:
                 discards, self.forgotten = False, before
                 self.block.clear()
                 self.splats = None
+                if self.masks is not None:
+                    self.masks.clear()
             if stage.images is not None and done == 0:
                 stage.images.begin(self.block, self.splats, before)
             compiled = self.run_pass(stage, spp)
@@ -316,7 +328,7 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if not self.freezes_passes or self.integrator.aov_names():
+        if not self.freezes_passes or self.integrator.aov_names() or self.masks is not None:
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False
@@ -344,7 +356,13 @@ class Job:
         if self.plan.structured:
             sampler.advance()
             sampler.schedule_state()
-        dr.eval(self.block.tensor(), self.splats and self.splats.tensor(), self.tally)
+        self._evaluate(self.splats and self.splats.tensor())
+
+    def _evaluate(self, *others: Any) -> None:
+        """Evaluates the samples of a pass, and ``others`` in the same kernel."""
+        dr.eval(self.block.tensor(), self.tally, *others, self.masks and self.masks.taken)
+        if self.masks is not None:
+            self.masks.put()
 
     def _sample(
         self, stage: Stage, sampler: mi.Sampler, rays: CameraRays, count: mi.Float | float = 1.0
@@ -357,6 +375,8 @@ class Job:
             raise GradientsError
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs, count)
+        if self.masks is not None:
+            self.masks.take(rays, count)
         count_rays(self.tally, sample)
         return sample
 

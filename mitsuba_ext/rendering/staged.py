@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import mitsuba as mi
 
+from ..images.coverage import Coverage
 from .device import SampleBytes
 from .request import Request
 from .stages import Learning, Schedule, Stage
@@ -19,12 +21,18 @@ class Staged(Protocol):
     Attributes:
         statistics: Set when a render begins.
         is_cancelled: Whether the running render is to end after the current pass.
+        masks: The names and types of its masks.
+        coverage: Set after a render with masks.
+        hide_emitters: Whether camera rays pass through area lights.
     """
 
     name: str
     statistics: RenderStatistics
     is_cancelled: bool
     samples_per_pass: int
+    masks: Sequence[tuple[str, str]]
+    coverage: Coverage | None
+    hide_emitters: bool
 
     @property
     def sample_cost(self) -> int:
@@ -58,7 +66,10 @@ class Staged(Protocol):
         the last stage), and which learns as planned."""
 
     def aov_names(self) -> list[str]:
-        """Channels besides colour and alpha."""
+        """Channels of the film besides colour and alpha."""
+
+    def prepare_aovs(self, scene: mi.Scene) -> None:
+        """Prepares :meth:`sample_aovs` for a scene."""
 
     def sample_aovs(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f

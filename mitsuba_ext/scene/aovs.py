@@ -1,9 +1,11 @@
-"""Checks lists of arbitrary output variables before Mitsuba's ``aov`` reads them: an item without a
-type makes Mitsuba 3.9.1 crash (a segmentation fault)."""
+"""Reads lists of arbitrary output variables, ``name:type,name:type``, and checks them before
+Mitsuba's ``aov`` reads them: an item without a type makes Mitsuba 3.9.1 crash (a segmentation
+fault)."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -16,23 +18,59 @@ AOV_TYPES = (
 )  # fmt: skip
 
 
-def check_aovs(plugin: str, aovs: str) -> None:
-    """Checks a list of output variables, ``name:type,name:type``.
+#: Types of masks: the number of the object or material that covers most of a pixel, and Cryptomatte.
+#: They are computed by our integrators only.
+MASK_TYPES = ("object_id", "material_id", "cryptomatte_object", "cryptomatte_material")
+
+
+def split_aovs(aovs: str) -> list[tuple[str, str]]:
+    """The names and types of a list of output variables."""
+    items = filter(None, re.split("[, ]", aovs))  # as Mitsuba splits it
+    return [(name, kind) for name, _colon, kind in (item.partition(":") for item in items)]
+
+
+def check_aovs(plugin: str, aovs: str, types: Sequence[str] = AOV_TYPES) -> None:
+    """Checks a list of output variables.
 
     Args:
         plugin: The plugin that has the parameter ``aovs``.
         aovs: The list.
+        types: The types that the plugin accepts.
 
     Raises:
-        ValueError: An item does not have this form, or its type is unknown.
+        ValueError: An item does not have the form ``name:type``, its type is unknown, or two masks
+            have the same name.
     """
-    for item in filter(None, re.split("[, ]", aovs)):  # as Mitsuba splits it
-        name, _colon, kind = item.partition(":")
-        if not name or kind not in AOV_TYPES:
+    items = split_aovs(aovs)
+    for name, kind in items:
+        if name and kind in types:
+            continue
+        hint = ""
+        if name and kind in MASK_TYPES:
+            hint = f' ("{kind}" is a type of the parameter "aovs" of our integrators)'
+        raise ValueError(
+            f'"{plugin}": the parameter "aovs" must be a list of name:type, such as '
+            f'"d:depth,n:sh_normal", and not "{name}{":" * bool(kind)}{kind}"; the types are '
+            f"{', '.join(types)}{hint}"
+        )
+    masks = [name for name, kind in items if kind in MASK_TYPES]
+    for name in masks:
+        if [other for other, _kind in items].count(name) > 1:
             raise ValueError(
-                f'"{plugin}": the parameter "aovs" must be a list of name:type, such as '
-                f'"d:depth,n:sh_normal", and not "{item}"; the types are {", ".join(AOV_TYPES)}'
+                f'"{plugin}": the parameter "aovs" has the name "{name}" twice: give each mask '
+                f"a name of its own"
             )
+
+
+def has_masks(state: mi.parser.ParserState) -> bool:
+    """Whether an integrator of a parsed scene has masks."""
+    texts = [node.props.get("aovs", "") for node in state.nodes]
+    return any(
+        kind in MASK_TYPES
+        for text in texts
+        if isinstance(text, str)
+        for _name, kind in split_aovs(text)
+    )
 
 
 def check_nodes(state: mi.parser.ParserState) -> None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 
+from ...scene.aovs import split_aovs
+from ...scene.surface_names import SurfaceNames
 from .lightweight_scene import LightweightQuery
 from .moving_aovs import moving_aovs
 from .moving_scene import MovingSceneQuery
 from .scene import scene_query
+from .visible_surface import object_number
 
 
 def output_variables(
@@ -19,13 +20,25 @@ def output_variables(
     scene: mi.Scene,
     sampler: mi.Sampler,
     ray: mi.RayDifferential3f,
+    names: SurfaceNames | None = None,
 ) -> list[mi.Float]:
     """The channels along camera rays, at their times.
 
     Parameters:
         aov: Mitsuba's integrator, made with the list ``aovs``.
+        names: The names of the objects, if the list has a ``shape_index``: Mitsuba's is a pointer.
     """
     query = scene_query(scene)
+    values = _values(aov, aovs, query, scene, sampler, ray)
+    channels = aov.aov_names()
+    for name in [name for name, kind in split_aovs(aovs) if kind == "shape_index"]:
+        pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
+        number = object_number(names, query.interaction(pi, ray))
+        values[channels.index(f"{name}.I")] = mi.Float(number)
+    return values
+
+
+def _values(aov, aovs, query, scene, sampler, ray) -> list[mi.Float]:
     rest = query.rest if isinstance(query, LightweightQuery) else query
     if isinstance(rest, MovingSceneQuery):
         values = moving_aovs(aov, aovs, rest, scene, sampler, ray)
@@ -39,7 +52,7 @@ def output_variables(
     si = dr.select(
         is_lightweight, query.interaction(pi, ray_alone), dr.zeros(mi.SurfaceInteraction3f)
     )
-    kinds = [item.partition(":")[2] for item in filter(None, re.split("[, ]", aovs))]
+    kinds = [kind for _name, kind in split_aovs(aovs)]
     mine = [channel for kind in kinds for channel in _channels(kind, si, ray, is_lightweight)]
     return [dr.select(is_lightweight, a, b) for a, b in zip(mine, values)]
 
@@ -57,8 +70,8 @@ def _channels(
         si.compute_uv_partials(ray)
     if kind == "prim_index":
         return [mi.Float(si.prim_index)]
-    if kind == "shape_index":
-        return [mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))]
+    if kind == "shape_index":  # replaced by the caller
+        return [mi.Float(0)]
     return list(getattr(si, {"position": "p", "geo_normal": "n"}.get(kind, kind)))
 
 

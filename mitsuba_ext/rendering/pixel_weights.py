@@ -1,0 +1,174 @@
+"""The sums of the filter weights of samples, for each pixel and each label of samples.
+
+Few labels occur in a pixel, but a scene may have thousands. The sums are therefore in a hash table
+with open addressing, whose keys are pairs of a pixel and a label. A kernel finds or claims slots
+with atomic compare-and-swap operations. Weights are added as integers: their sum does not depend on
+the order, so the same samples always give exactly the same result.
+
+Source: D. E. Knuth, *The Art of Computer Programming*, volume 3, section 6.4 (open addressing).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: The weight 1, as an integer.
+ONE = 2.0**30
+
+#: Slots for each pixel at the start. Keys of a pixel are there first, and then anywhere.
+_SLOTS = 2
+
+#: The number of slots after which the search for a key gives up, and the table grows.
+_MOST_ATTEMPTS = 32
+
+
+class _Sizes(NamedTuple):
+    """The sizes of a table, as arrays of one number."""
+
+    width: mi.UInt32
+    height: mi.UInt32
+    label_count: mi.UInt32
+    slots: mi.UInt32
+
+
+class PixelWeights:
+    """Sums of weights, by pixel and label.
+
+    Parameters:
+        film: The film, whose reconstruction filter weights the samples.
+        label_count: The number of labels.
+    """
+
+    def __init__(self, film: mi.Film, label_count: int) -> None:
+        self._filter = film.rfilter()
+        self._width, self._height = (int(x) for x in film.crop_size())
+        self._offset = mi.ScalarPoint2f(film.crop_offset())
+        self._label_count = max(1, label_count)
+        self._pixel_count = self._width * self._height
+        fits = self._pixel_count * self._label_count < 2**32 - 1
+        self._type = mi.UInt32 if fits else mi.UInt64
+        self._empty = 2**32 - 1 if fits else 2**64 - 1
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets all samples."""
+        self._slots, self._table = _SLOTS, self._no_keys(_SLOTS)
+
+    def put(self, position: mi.Point2f, weight: mi.Float, label: mi.UInt32) -> None:
+        """Adds samples.
+
+        Parameters:
+            position: Where the samples are on the film.
+            weight: Their weights.
+            label: Their labels.
+        """
+        dr.eval(position, weight, label)  # the table may have to grow, and take them again
+        while True:
+            keys, sums = (dr.copy(array) for array in self._table)
+            lost = dr.zeros(mi.UInt32, 1)
+            self._put(self._sizes(), self._table[0], keys, sums, lost, position, weight, label)
+            dr.eval(keys, sums, lost)
+            if int(lost[0]) == 0:
+                self._table = keys, sums
+                return
+            self._grow()
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The pixels (row by row in the crop window), labels and sums of weights, sorted by pixel
+        and label. Sums are integers: :data:`ONE` stands for 1."""
+        keys, sums = (array.numpy() for array in self._table)
+        is_used = keys != np.iinfo(keys.dtype).max
+        keys, sums = keys[is_used], sums[is_used].astype(np.int64)
+        order = np.argsort(keys)
+        pixel, label = np.divmod(keys[order], keys.dtype.type(self._label_count))
+        return pixel.astype(np.uint32), label.astype(np.uint32), sums[order]
+
+    # ---- Helpers ----
+
+    def _no_keys(self, slots: int) -> tuple[mi.UInt32 | mi.UInt64, mi.UInt64]:
+        count = self._pixel_count * slots
+        table = dr.full(self._type, self._empty, count), dr.zeros(mi.UInt64, count)
+        dr.make_opaque(table)
+        return table
+
+    def _grow(self) -> None:
+        old, is_lost = self._table, True
+        while is_lost:
+            self._slots *= 2
+            self._table, lost = self._no_keys(self._slots), dr.zeros(mi.UInt32, 1)
+            self._move(self._sizes(), self._no_keys(self._slots)[0], *old, *self._table, lost)
+            dr.eval(self._table, lost)
+            is_lost = int(lost[0]) > 0
+
+    def _sizes(self) -> _Sizes:
+        # Opaque, so that films and scenes share kernels
+        numbers = self._width, self._height, self._label_count, self._slots
+        return _Sizes(*(dr.opaque(mi.UInt32, number) for number in numbers))
+
+    def _claimed(self, sizes, known, keys, key, attempt, active) -> tuple[mi.UInt32, mi.Bool]:
+        """The slot in which a key is looked for at an attempt, and whether it is, or becomes, the
+        slot of the key.
+
+        Parameters:
+            known: The keys before this kernel. Most keys are there, and need no atomic operation.
+            keys: The keys, to which new ones are added.
+        """
+        near = mi.UInt32(key // self._type(sizes.label_count)) * sizes.slots + attempt
+        number = mi.UInt64(key)
+        mixed = mi.sample_tea_32(mi.UInt32(number), mi.UInt32(number >> 32) + attempt, 4)[0]
+        far = mixed % (sizes.width * sizes.height * sizes.slots)
+        slot = dr.select(attempt < _SLOTS, near, far)
+        found = dr.gather(self._type, known, slot, active)
+        is_free = active & (found == self._empty)
+        before, is_new = dr.scatter_cas(keys, self._type(self._empty), key, slot, is_free)
+        return slot, active & ((found == key) | is_new | (is_free & (before == key)))
+
+    @dr.syntax
+    def _put(self, sizes, known, keys, sums, lost, position, weight, label):
+        center = position - self._offset - 0.5
+        radius, size = self._filter.radius(), mi.ScalarPoint2f(self._width, self._height)
+        side = 1 if self._filter.is_box_filter() else int(np.ceil(2 * radius))
+        # The pixels that the filter covers, as in ``ImageBlock::put``
+        if dr.hint(side == 1, mode="scalar"):
+            first = mi.Point2i(dr.floor(position - self._offset))
+        else:
+            first = mi.Point2i(dr.ceil(center - radius))
+        width, height = mi.Int32(sizes.width), mi.Int32(sizes.height)
+        index, attempt = mi.UInt32(0), mi.UInt32(0)
+        active = weight != 0
+        while active:
+            row = index // side
+            pixel = first + mi.Point2i(mi.Int32(index - row * side), mi.Int32(row))
+            away = mi.Point2f(pixel) - center
+            share = weight
+            if dr.hint(side > 1, mode="scalar"):
+                share = weight * self._filter.eval(away.x) * self._filter.eval(away.y)
+            covers = (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
+            covers &= (share != 0)
+            number = mi.UInt32(pixel.y * width + pixel.x)
+            key = self._type(number) * self._type(sizes.label_count) + self._type(label)
+            slot, is_mine = self._claimed(sizes, known, keys, key, attempt, active & covers)
+            value = mi.UInt64(mi.Int64(dr.round(mi.Float64(share) * ONE)))
+            dr.scatter_add(sums, value, slot, is_mine)
+            gives_up = attempt == _MOST_ATTEMPTS
+            dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), covers & gives_up & ~is_mine)
+            is_next = is_mine | gives_up | ~covers
+            attempt = dr.select(is_next, 0, attempt + 1)
+            index = dr.select(is_next, index + 1, index)
+            active &= index < side * side
+
+    @dr.syntax
+    def _move(self, sizes, empty, old_keys, old_sums, keys, sums, lost):
+        """Copies a smaller table."""
+        attempt, active = mi.UInt32(0), old_keys != self._empty
+        while active:
+            slot, is_mine = self._claimed(sizes, empty, keys, old_keys, attempt, active)
+            dr.scatter(sums, old_sums, slot, is_mine)
+            gives_up = attempt == _MOST_ATTEMPTS
+            dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), gives_up & ~is_mine)
+            attempt += 1
+            active &= ~is_mine & ~gives_up

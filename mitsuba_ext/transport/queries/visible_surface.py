@@ -1,0 +1,71 @@
+"""What covers a pixel: the first surface that a camera ray meets and does not see through."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...scene.bsdfs import is_in_table
+from ...scene.surface_names import SurfaceNames
+from ...util.arrays import channel_mean
+from ..hidden_emitters import behind_emitters
+from ..scene_query import SceneQuery
+
+
+def visible_surface(
+    query: SceneQuery, scene: mi.Scene, ray: mi.Ray3f, names: SurfaceNames, hide_emitters: bool
+) -> mi.SurfaceInteraction3f:
+    """The surface that covers the pixel of each ray.
+
+    Opacity masks, the BSDF ``null`` and filters of light are transparent: a ray passes through them
+    with the probability of the light that passes straight on. Panes of ``thindielectric``, glass
+    and mirrors cover the pixel.
+
+    Parameters:
+        hide_emitters: Whether rays pass through area lights.
+    """
+    ray = mi.Ray3f(ray)
+    pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
+    if hide_emitters:
+        ray, pi = behind_emitters(query, scene, ray, pi, mi.Bool(True))
+    si = query.interaction(pi, ray)
+    return si if names.transparent is None else _behind(query, scene, ray, si, names.transparent)
+
+
+@dr.syntax
+def _behind(query, scene, ray, si, transparent):
+    # Random numbers of the ray itself, so that masks do not change the numbers of the image
+    bits = [dr.reinterpret_array(mi.UInt32, x) for x in (*ray.o, *ray.d, ray.time)]
+    first, second = bits[0] + 3 * bits[2] + 5 * bits[4], bits[1] + 3 * bits[3] + 5 * bits[5]
+    second += 7 * bits[6]
+    active = si.is_valid()
+    while active:
+        bsdf = si.bsdf()
+        T = channel_mean(mi.unpolarized_spectrum(bsdf.eval_null_transmission(si, active)))
+        first += 0x9E3779B9
+        active &= is_in_table(transparent, bsdf)
+        active &= mi.sample_tea_float32(first, second) < T
+        ray = query.starts.along(si, ray.d)
+        pi = query.closest(scene, ray, coherent=False, active=active)
+        if active:
+            si = query.interaction(pi, ray)
+        active &= si.is_valid()
+    return si
+
+
+def object_number(names: SurfaceNames, si: mi.SurfaceInteraction3f) -> mi.UInt32:
+    """The number of the object at ``si``; 0 where there is none."""
+    shape = si.shape
+    if names.has_instances:
+        shape = dr.select(si.instance != None, si.instance, shape)  # noqa: E711
+    return _looked_up(names.object_numbers, shape, si.is_valid())
+
+
+def material_number(names: SurfaceNames, si: mi.SurfaceInteraction3f) -> mi.UInt32:
+    """The number of the material at ``si``; 0 where there is none."""
+    return _looked_up(names.material_numbers, si.bsdf(), si.is_valid())
+
+
+def _looked_up(table: mi.UInt32, pointer: mi.ShapePtr | mi.BSDFPtr, active: mi.Bool) -> mi.UInt32:
+    index = dr.reinterpret_array(mi.UInt32, pointer)
+    return dr.gather(mi.UInt32, table, index, active & (index < dr.width(table)))
