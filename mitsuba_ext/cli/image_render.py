@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..images import denoising, image_files
+from ..images.coverage import channel_names
 from ..inputs.chosen import LastScene
 from ..inputs.scene_changes import SceneChanges
 from ..inputs.variants import select_variant
@@ -163,8 +164,11 @@ def render_image(
                 )  # fmt: skip
                 job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled
+            masks = channel_names(getattr(job.integrator, "masks", ()))
             for file in filter(None, (output, order.preview)):
-                image_files.check_film(file, job.film, job.integrator.aov_names())
+                image_files.check_film(file, job.film, [*job.integrator.aov_names(), *masks])
+            if masks and output.suffix.lower() != ".exr":
+                report.warn(f"{output}: only an .exr can hold masks")
             if job.chosen.note:
                 report.note(job.chosen.note)
             remarks += job.chosen.remarks(is_sensor_chosen=sensor_index is not None)

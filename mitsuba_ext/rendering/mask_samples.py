@@ -53,13 +53,13 @@ class MaskSamples:
 
     def take(self, rays: CameraRays, count: mi.Float | float) -> None:
         """Takes samples. ``count`` is the weight of each."""
-        si = visible_surface(self._query, self._scene, rays.ray, self._names, self._hides)
+        found = visible_surface(self._query, self._scene, rays.ray, self._names, self._hides)
         label = mi.UInt32(0)
         if self._has[0]:
             count_of_materials = dr.opaque(mi.UInt32, len(self._materials) + 1)
-            label += object_number(self._names, si) * count_of_materials
+            label += object_number(self._names, found) * count_of_materials
         if self._has[1]:
-            label += material_number(self._names, si)
+            label += material_number(self._names, found)
         weight = mi.Float(rays.weight * count) + dr.zeros(mi.Float, dr.width(rays.position))
         self.taken.append((rays.position, weight, label))
 

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: The weight 1, as an integer.
-ONE = 2.0**30
+#: The weight 1 as an integer, and the largest weight of a sample, so that 32 bits can hold it.
+ONE, _MOST = 2.0**20, 2000.0
 
 #: Slots for each pixel at the start. Keys of a pixel are there first, and then anywhere.
 _SLOTS = 2
@@ -109,7 +109,8 @@ class PixelWeights:
         numbers = self._width, self._height, self._label_count, self._slots
         return _Sizes(*(dr.opaque(mi.UInt32, number) for number in numbers))
 
-    def _claimed(self, sizes, known, keys, key, attempt, active) -> tuple[mi.UInt32, mi.Bool]:
+    @dr.syntax
+    def _claimed(self, sizes, known, keys, pixel, key, attempt, active) -> tuple[mi.UInt32, mi.Bool]:
         """The slot in which a key is looked for at an attempt, and whether it is, or becomes, the
         slot of the key.
 
@@ -117,15 +118,17 @@ class PixelWeights:
             known: The keys before this kernel. Most keys are there, and need no atomic operation.
             keys: The keys, to which new ones are added.
         """
-        near = mi.UInt32(key // self._type(sizes.label_count)) * sizes.slots + attempt
-        number = mi.UInt64(key)
-        mixed = mi.sample_tea_32(mi.UInt32(number), mi.UInt32(number >> 32) + attempt, 4)[0]
-        far = mixed % (sizes.width * sizes.height * sizes.slots)
+        near = pixel * sizes.slots + attempt
+        mixed = mi.UInt32(key) * 0x9E3779B1 + (pixel + attempt) * 0x85EBCA6B
+        mixed = (mixed ^ mixed >> 15) * 0x2C1B3C6D
+        far = dr.mul_hi(mixed ^ mixed >> 12, sizes.width * sizes.height * sizes.slots)
         slot = dr.select(attempt < _SLOTS, near, far)
         found = dr.gather(self._type, known, slot, active)
-        is_free = active & (found == self._empty)
-        before, is_new = dr.scatter_cas(keys, self._type(self._empty), key, slot, is_free)
-        return slot, active & ((found == key) | is_new | (is_free & (before == key)))
+        is_mine = active & (found == key)
+        if active & (found == self._empty):
+            before, is_new = dr.scatter_cas(keys, self._type(self._empty), key, slot)
+            is_mine = is_new | (before == key)
+        return slot, is_mine
 
     @dr.syntax
     def _put(self, sizes, known, keys, sums, lost, position, weight, label):
@@ -151,11 +154,14 @@ class PixelWeights:
             covers &= (share != 0)
             number = mi.UInt32(pixel.y * width + pixel.x)
             key = self._type(number) * self._type(sizes.label_count) + self._type(label)
-            slot, is_mine = self._claimed(sizes, known, keys, key, attempt, active & covers)
-            value = mi.UInt64(mi.Int64(dr.round(mi.Float64(share) * ONE)))
+            slot, is_mine = self._claimed(
+                sizes, known, keys, number, key, attempt, active & covers
+            )
+            value = mi.UInt64(mi.Int64(mi.Int32(dr.round(dr.clip(share, -_MOST, _MOST) * ONE))))
             dr.scatter_add(sums, value, slot, is_mine)
             gives_up = attempt == _MOST_ATTEMPTS
-            dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), covers & gives_up & ~is_mine)
+            if active & covers & gives_up & ~is_mine:
+                dr.scatter(lost, mi.UInt32(1), mi.UInt32(0))
             is_next = is_mine | gives_up | ~covers
             attempt = dr.select(is_next, 0, attempt + 1)
             index = dr.select(is_next, index + 1, index)
@@ -165,10 +171,11 @@ class PixelWeights:
     def _move(self, sizes, empty, old_keys, old_sums, keys, sums, lost):
         """Copies a smaller table."""
         attempt, active = mi.UInt32(0), old_keys != self._empty
+        pixel = mi.UInt32(old_keys // self._type(sizes.label_count))
         while active:
-            slot, is_mine = self._claimed(sizes, empty, keys, old_keys, attempt, active)
+            slot, is_mine = self._claimed(sizes, empty, keys, pixel, old_keys, attempt, active)
             dr.scatter(sums, old_sums, slot, is_mine)
             gives_up = attempt == _MOST_ATTEMPTS
-            dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), gives_up & ~is_mine)
+            dr.scatter(lost, mi.UInt32(1), mi.UInt32(0), active & gives_up & ~is_mine)
             attempt += 1
             active &= ~is_mine & ~gives_up

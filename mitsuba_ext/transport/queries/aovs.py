@@ -11,7 +11,7 @@ from .lightweight_scene import LightweightQuery
 from .moving_aovs import moving_aovs
 from .moving_scene import MovingSceneQuery
 from .scene import scene_query
-from .visible_surface import object_number
+from .visible_surface import first_surface, object_number
 
 
 def output_variables(
@@ -32,8 +32,7 @@ def output_variables(
     values = _values(aov, aovs, query, scene, sampler, ray)
     channels = aov.aov_names()
     for name in [name for name, kind in split_aovs(aovs) if kind == "shape_index"]:
-        pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
-        number = object_number(names, query.interaction(pi, ray))
+        number = object_number(names, first_surface(query, scene, ray, names))
         values[channels.index(f"{name}.I")] = mi.Float(number)
     return values
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 
@@ -12,9 +14,31 @@ from ..hidden_emitters import behind_emitters
 from ..scene_query import SceneQuery
 
 
+class VisibleSurface(NamedTuple):
+    """The surface that covers the pixel of a ray.
+
+    Attributes:
+        shape: The shape, inside an instance too.
+        instance: The instance, if the scene has any.
+        is_valid: Whether there is a surface.
+    """
+
+    shape: mi.ShapePtr
+    instance: mi.ShapePtr | None
+    is_valid: mi.Bool
+
+
+def first_surface(
+    query: SceneQuery, scene: mi.Scene, ray: mi.Ray3f, names: SurfaceNames
+) -> VisibleSurface:
+    """The first surface that each ray meets."""
+    pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
+    return _surface(query, ray, pi, names)
+
+
 def visible_surface(
     query: SceneQuery, scene: mi.Scene, ray: mi.Ray3f, names: SurfaceNames, hide_emitters: bool
-) -> mi.SurfaceInteraction3f:
+) -> VisibleSurface:
     """The surface that covers the pixel of each ray.
 
     Opacity masks, the BSDF ``null`` and filters of light are transparent: a ray passes through them
@@ -28,8 +52,17 @@ def visible_surface(
     pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
     if hide_emitters:
         ray, pi = behind_emitters(query, scene, ray, pi, mi.Bool(True))
-    si = query.interaction(pi, ray)
-    return si if names.transparent is None else _behind(query, scene, ray, si, names.transparent)
+    if names.transparent is None:
+        return _surface(query, ray, pi, names)
+    si = _behind(query, scene, ray, query.interaction(pi, ray), names.transparent)
+    return VisibleSurface(si.shape, si.instance, si.is_valid())
+
+
+def _surface(query, ray, pi, names) -> VisibleSurface:
+    if not names.has_instances:
+        return VisibleSurface(pi.shape, None, pi.is_valid())
+    si = query.interaction(pi, ray)  # which finds the shape inside an instance
+    return VisibleSurface(si.shape, si.instance, si.is_valid())
 
 
 @dr.syntax
@@ -53,17 +86,17 @@ def _behind(query, scene, ray, si, transparent):
     return si
 
 
-def object_number(names: SurfaceNames, si: mi.SurfaceInteraction3f) -> mi.UInt32:
-    """The number of the object at ``si``; 0 where there is none."""
-    shape = si.shape
+def object_number(names: SurfaceNames, surface: VisibleSurface) -> mi.UInt32:
+    """The number of the object; 0 where there is none."""
+    shape = surface.shape
     if names.has_instances:
-        shape = dr.select(si.instance != None, si.instance, shape)  # noqa: E711
-    return _looked_up(names.object_numbers, shape, si.is_valid())
+        shape = dr.select(surface.instance != None, surface.instance, shape)  # noqa: E711
+    return _looked_up(names.object_numbers, shape, surface.is_valid)
 
 
-def material_number(names: SurfaceNames, si: mi.SurfaceInteraction3f) -> mi.UInt32:
-    """The number of the material at ``si``; 0 where there is none."""
-    return _looked_up(names.material_numbers, si.bsdf(), si.is_valid())
+def material_number(names: SurfaceNames, surface: VisibleSurface) -> mi.UInt32:
+    """The number of the material; 0 where there is none."""
+    return _looked_up(names.material_numbers, surface.shape.bsdf(), surface.is_valid)
 
 
 def _looked_up(table: mi.UInt32, pointer: mi.ShapePtr | mi.BSDFPtr, active: mi.Bool) -> mi.UInt32:
