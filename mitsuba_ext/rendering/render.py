@@ -368,6 +368,10 @@ class Job:
         self, stage: Stage, sampler: mi.Sampler, rays: CameraRays, count: mi.Float | float = 1.0
     ) -> Sample:
         """Puts the samples of these rays, without their splats, into the block."""
+        if self.masks is not None:
+            # Before the samples of the image: a BSDF that is asked for its transmission may read
+            # an array on the host, which evaluates the samples in the block so far
+            self.masks.take(rays, count)
         if stage.observer is not None:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
@@ -375,8 +379,6 @@ class Job:
             raise GradientsError
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs, count)
-        if self.masks is not None:
-            self.masks.take(rays, count)
         count_rays(self.tally, sample)
         return sample
 

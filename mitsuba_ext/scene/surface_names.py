@@ -167,6 +167,8 @@ def _materials(objects: Sequence[tuple[str, _Object]]) -> dict[mi.BSDF, str]:
     """The names of all BSDFs."""
     owners: dict[mi.BSDF, list[str]] = defaultdict(list)
     for name, found in objects:
+        if found.shape.class_name() == "Instance":  # has a BSDF that nobody sees
+            continue
         if (bsdf := surface(found.shape).bsdf()) is not None:
             owners[bsdf].append(name)
     ids = {bsdf: _id(bsdf) for bsdf in owners}

@@ -32,6 +32,7 @@ def first_surface(
     query: SceneQuery, scene: mi.Scene, ray: mi.Ray3f, names: SurfaceNames
 ) -> VisibleSurface:
     """The first surface that each ray meets."""
+    ray = mi.Ray3f(ray)
     pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
     return _surface(query, ray, pi, names)
 
@@ -52,10 +53,9 @@ def visible_surface(
     pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
     if hide_emitters:
         ray, pi = behind_emitters(query, scene, ray, pi, mi.Bool(True))
-    if names.transparent is None:
-        return _surface(query, ray, pi, names)
-    si = _behind(query, scene, ray, query.interaction(pi, ray), names.transparent)
-    return VisibleSurface(si.shape, si.instance, si.is_valid())
+    if names.transparent is not None:
+        ray, pi = _behind(query, scene, ray, pi, names)
+    return _surface(query, ray, pi, names)
 
 
 def _surface(query, ray, pi, names) -> VisibleSurface:
@@ -65,25 +65,33 @@ def _surface(query, ray, pi, names) -> VisibleSurface:
     return VisibleSurface(si.shape, si.instance, si.is_valid())
 
 
+def _may_be_transparent(pi: mi.PreliminaryIntersection3f, names: SurfaceNames) -> mi.Bool:
+    found = is_in_table(names.transparent, pi.shape.bsdf())
+    if names.has_instances:  # the shape inside is not known yet
+        found |= pi.instance != None  # noqa: E711
+    return pi.is_valid() & found
+
+
 @dr.syntax
-def _behind(query, scene, ray, si, transparent):
+def _behind(query, scene, ray, pi, names):
+    """The first surface that is not transparent, and the ray that meets it."""
     # Random numbers of the ray itself, so that masks do not change the numbers of the image
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (*ray.o, *ray.d, ray.time)]
     first, second = bits[0] + 3 * bits[2] + 5 * bits[4], bits[1] + 3 * bits[3] + 5 * bits[5]
     second += 7 * bits[6]
-    active = si.is_valid()
+    active = _may_be_transparent(pi, names)
     while active:
+        si = query.interaction(pi, ray)
         bsdf = si.bsdf()
         T = channel_mean(mi.unpolarized_spectrum(bsdf.eval_null_transmission(si, active)))
         first += 0x9E3779B9
-        active &= is_in_table(transparent, bsdf)
+        active &= is_in_table(names.transparent, bsdf)
         active &= mi.sample_tea_float32(first, second) < T
-        ray = query.starts.along(si, ray.d)
-        pi = query.closest(scene, ray, coherent=False, active=active)
         if active:
-            si = query.interaction(pi, ray)
-        active &= si.is_valid()
-    return si
+            ray = query.starts.along(si, ray.d)
+            pi = query.closest(scene, ray, coherent=False, active=mi.Bool(True))
+        active &= _may_be_transparent(pi, names)
+    return ray, pi
 
 
 def object_number(names: SurfaceNames, surface: VisibleSurface) -> mi.UInt32:
