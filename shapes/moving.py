@@ -79,7 +79,7 @@ class Moving(mi.Mesh):
     which is otherwise the same as :monosp:`path`.
 
     The parameter :monosp:`aovs` of our integrators evaluates them at the time of each ray, in world
-    space (:monosp:`shape_index` is the index of the nested shape), so the film receives their mean
+    space (:monosp:`shape_index` is the number of the nested shape), so the film receives their mean
     over the shutter interval. For the values at a single time, open and close the shutter at that
     time.
 
