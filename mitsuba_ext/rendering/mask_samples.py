@@ -37,15 +37,14 @@ class MaskSamples:
     ) -> None:  # fmt: skip
         self._scene, self._query, self._hides = scene, scene_query(scene), hide_emitters
         self._names = names = surface_names(scene)
-        self._has = [any(which in kind for _name, kind in masks) for which in ("object", "material")]
-        if self._has[0] and names.merged:
+        self._objects = names.objects if _any_of("object", masks) else ()
+        self._materials = names.materials if _any_of("material", masks) else ()
+        if self._objects and names.merged:
             raise ValueError(
                 f'"{plugin}": Mitsuba has merged the meshes {names.merged}, and a mask cannot tell '
                 f"them apart: load the scene with mi.load_file(…, optimize=False), or "
                 f'mi.load_dict(…, optimize=False), and give each "merge" in it an id'
             )
-        self._objects = names.objects if self._has[0] else ()
-        self._materials = names.materials if self._has[1] else ()
         self._size = tuple(int(x) for x in film.crop_size())
         labels = (len(self._objects) + 1) * (len(self._materials) + 1)
         self._weights = PixelWeights(film, labels)
@@ -55,10 +54,10 @@ class MaskSamples:
         """Takes samples. ``count`` is the weight of each."""
         found = visible_surface(self._query, self._scene, rays.ray, self._names, self._hides)
         label = mi.UInt32(0)
-        if self._has[0]:
+        if self._objects:
             count_of_materials = dr.opaque(mi.UInt32, len(self._materials) + 1)
             label += object_number(self._names, found) * count_of_materials
-        if self._has[1]:
+        if self._materials:
             label += material_number(self._names, found)
         weight = mi.Float(rays.weight * count) + dr.zeros(mi.Float, dr.width(rays.position))
         self.taken.append((rays.position, weight, label))
@@ -77,3 +76,8 @@ class MaskSamples:
         """The coverage by all samples."""
         pixel, label, weight = self._weights.arrays()
         return Coverage(self._size, self._objects, self._materials, pixel, label, weight)
+
+
+def _any_of(level: str, masks: Sequence[tuple[str, str]]) -> bool:
+    """Whether any of the masks is of objects, or of materials."""
+    return any(level in kind for _name, kind in masks)

@@ -110,7 +110,7 @@ class PixelWeights:
         return _Sizes(*(dr.opaque(mi.UInt32, number) for number in numbers))
 
     @dr.syntax
-    def _claimed(self, sizes, known, keys, pixel, key, attempt, active) -> tuple[mi.UInt32, mi.Bool]:
+    def _claimed(self, sizes, known, keys, pixel, key, attempt, active):
         """The slot in which a key is looked for at an attempt, and whether it is, or becomes, the
         slot of the key.
 
@@ -133,7 +133,7 @@ class PixelWeights:
     @dr.syntax
     def _put(self, sizes, known, keys, sums, lost, position, weight, label):
         center = position - self._offset - 0.5
-        radius, size = self._filter.radius(), mi.ScalarPoint2f(self._width, self._height)
+        radius = self._filter.radius()
         side = 1 if self._filter.is_box_filter() else int(np.ceil(2 * radius))
         # The pixels that the filter covers, as in ``ImageBlock::put``
         if dr.hint(side == 1, mode="scalar"):

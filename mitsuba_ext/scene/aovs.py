@@ -18,8 +18,8 @@ AOV_TYPES = (
 )  # fmt: skip
 
 
-#: Types of masks: the number of the object or material that covers most of a pixel, and Cryptomatte.
-#: They are computed by our integrators only.
+#: Types of masks: the number of the object or material that covers most of a pixel, and
+#: Cryptomatte. They are computed by our integrators only.
 MASK_TYPES = ("object_id", "material_id", "cryptomatte_object", "cryptomatte_material")
 
 

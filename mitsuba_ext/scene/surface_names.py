@@ -1,14 +1,14 @@
 """The names of the objects and materials of a scene, which are the same in every process.
 
-Mitsuba loads the shapes of a file in parallel. Their order in ``scene.shapes()`` and Dr.Jit's numbers
-of them differ from run to run, so a name comes from the file:
+Mitsuba loads the shapes of a file in parallel. Their order in ``scene.shapes()`` and Dr.Jit's
+numbers of them differ from run to run, so a name comes from the file:
 
 - A shape has the ``id`` of its element (the key in a dict). An instance is one object, with the
   ``id`` of the instance. A shape without ``id`` in a ``moving`` has the ``id`` of that.
 - Without an ``id``, the name is the file or the type of the shape. Shapes that would have the same
   name get numbers, in the order of their bounding boxes.
-- A BSDF has its ``id``, or that of a BSDF nested in it. If there is none, or several BSDFs have the
-  same one (``bsdf`` in many dicts), the name of the first of its shapes precedes it.
+- A BSDF has its ``id``, or the ``id`` of a BSDF nested in it. If there is none, or several BSDFs
+  have the same one (``bsdf`` in many dicts), the name of the first of its shapes precedes it.
 """
 
 from __future__ import annotations

@@ -213,7 +213,7 @@ def test_an_empty_scene_has_empty_masks() -> None:
     assert not any(plane.any() for plane in channels.values())
 
 
-@pytest.mark.parametrize("name", ["neepp", "bdpt", "adaptive"])
+@pytest.mark.parametrize("name", ["bdpt", "adaptive"])
 def test_integrators_have_masks(name: str) -> None:
     scene = _load(_scene(left=_ball(-1), lamp=_ball(1, light={"type": "area"})))
     parameters = {"max_depth": 3, "aovs": "o:cryptomatte_object"}
@@ -228,16 +228,6 @@ def test_integrators_have_masks(name: str) -> None:
 
 
 # ---- Names ----
-
-
-def _named(scene: Scene) -> dict[tuple[float, ...], str]:
-    """The names of objects by the centre of their boxes."""
-    loaded = mi.load_dict(scene, optimize=False)
-    names = surface_names(loaded)
-    numbers = names.object_numbers.numpy()
-    pointers = dr.reinterpret_array(mi.UInt32, loaded.shapes_dr()).numpy()
-    centers = [tuple(np.round(shape.bbox().center(), 3)) for shape in loaded.shapes()]
-    return dict(zip(centers, (names.objects[numbers[each] - 1] for each in pointers)))
 
 
 def test_names_do_not_depend_on_the_order_of_shapes() -> None:
@@ -319,9 +309,7 @@ def test_merged_meshes_are_refused() -> None:
     ],
 )
 def test_wrong_lists_are_refused(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(RuntimeError, match=message) if "a:object" not in message else (
-        pytest.raises((RuntimeError, ValueError), match=message)
-    ):
+    with pytest.raises(RuntimeError, match=message):  # by which Mitsuba replaces other errors
         make()
 
 
