@@ -69,7 +69,7 @@ class TwoStages:
 
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
-        self.is_cancelled = False
+        self.is_cancelled, self.masks = False, ()
         self.name, self.sample_cost, self.sample_bytes = "two_stages", 1, SampleBytes()
 
     def plan_learning(self, request, spp):
@@ -86,6 +86,9 @@ class TwoStages:
 
     def aov_names(self):
         return []
+
+    def prepare_aovs(self, scene):
+        pass
 
     def sample_aovs(self, scene, sampler, ray):
         return []
