@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from pathlib import Path
 
@@ -113,3 +114,22 @@ def test_the_check_of_a_film_keeps_its_crop_window(tmp_path):
     image_files.check_film(tmp_path / "a.exr", film, ["a.R"])
     assert list(film.crop_size()) == [5, 4] and list(film.crop_offset()) == [3, 2]
     assert list(film.size()) == [20, 10] and not list(tmp_path.iterdir())
+
+
+def test_render_writes_cryptomattes_of_objects_that_mitsuba_would_merge(
+    run, make_scene, tmp_path
+):
+    cubes = "".join(
+        f'<shape type="cube" id="{name}"><transform name="to_world"><translate x="{x}" z="8"/>'
+        f'</transform><bsdf type="diffuse"/></shape>'
+        for name, x in (("left", 1.5), ("right", -1.5))
+    )
+    wish = ("--integrator", "composed_path:max_depth=1,aovs=o:cryptomatte_object")
+    output = tmp_path / "image.exr"
+    assert run("render", make_scene(body=cubes), "-o", output, *wish)[0] == 0
+    channels, metadata = read_exr(output)
+    (manifest,) = (text for key, text in metadata.items() if key.endswith("/manifest"))
+    assert set(json.loads(manifest)) == {"left", "right"}
+    assert len(np.unique(channels["o00.r"])) == 3 and channels["o00.g"].max() == 1
+    err = run("render", make_scene(body=cubes), "-o", tmp_path / "image.png", *wish)[2]
+    assert "only an .exr can hold masks" in err
