@@ -93,7 +93,8 @@ def auto(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -142,7 +143,8 @@ def auto_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -202,7 +204,8 @@ def bdpt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -289,7 +292,8 @@ def composed_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -447,7 +451,8 @@ def erpt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -512,7 +517,8 @@ def instant_radiosity(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -565,7 +571,8 @@ def irradiance_cache(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -601,7 +608,8 @@ def light_tracer(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -662,7 +670,8 @@ def mlt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -732,7 +741,8 @@ def neepp(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -787,7 +797,8 @@ def photon_map(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -852,7 +863,8 @@ def pss_guided(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -910,7 +922,8 @@ def pssmlt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -964,7 +977,8 @@ def reweighted_direct(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -1105,7 +1119,8 @@ def sppm(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -1179,7 +1194,8 @@ def swarm_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -1243,7 +1259,8 @@ def two_stage(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
@@ -1331,7 +1348,8 @@ def vcm(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal. (Default: none)
+            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
+            cryptomatte_object and cryptomatte_material. (Default: none)
     """
 
 
