@@ -163,6 +163,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         :class:`~mitsuba_ext.rendering.request.Request`, such as a ``timeout`` in the place of the
         parameter of that name."""
         spp = self._checked(scene, spp) or self.default_spp
+        self.look_at(scene)
         sensor = camera.find_sensor(scene, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         own = {"timeout": self.timeout, "progress": self.progress, "watch": self.watch}
@@ -183,6 +184,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def render_once(self, request: Request) -> mi.TensorXf:
         """Renders the whole image, or one batch of a checkpointed render."""
         return rendering.render(self, request)
+
+    def look_at(self, scene: mi.Scene) -> None:
+        """Makes what the channels of :meth:`aov_names` need to know of a scene. A render calls it
+        first."""
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names; none by default."""

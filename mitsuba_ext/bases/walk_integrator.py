@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,15 @@ from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
-from ..scene.aovs import check_aovs
+from ..scene.aovs import Aovs
+from ..scene.light_groups import light_groups
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.observer import Observer
+from ..transport.path_channels import PathChannels
 from ..transport.path_decisions import SceneQuery
 from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
@@ -73,7 +76,10 @@ class WalkIntegrator(StagedIntegrator):
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+         :monosp:`depth:depth,nn:sh_normal`. Besides Mitsuba's types, there are named passes
+         (:monosp:`direct`, :monosp:`caustics`, …), light path expressions
+         (:monosp:`key:C.*<L.'key'>`), and a channel for each light group
+         (:monosp:`groups:light_groups`). (Default: none)
 
     Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
     ``keep_learned``; see :class:`composed_path`.
@@ -83,12 +89,15 @@ class WalkIntegrator(StagedIntegrator):
         can_clamp (bool): Whether it has the parameters ``clamp_direct`` and ``clamp_indirect``.
         sees_media (bool): Whether it renders participating media. If not, it refuses them.
         light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
+        no_expressions (str): Why it cannot render light path expressions; empty if it can. The text
+            ends a sentence in an error message.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
     """
 
     has_light_paths = light_paths_see_media = can_clamp = False
     sees_media = True
+    no_expressions = ""
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -98,7 +107,17 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.clamps = self._read_clamps(props, read)
         self.aovs = read("aovs", "")
-        self._aovs = self._aov_integrator(self.aovs)
+        self._list = Aovs.read(self.name, self.aovs)
+        self._aovs: mi.Integrator | None = None
+        if by_mitsuba := self._list.by_mitsuba:
+            self._aovs = mi.load_dict({"type": "aov", "aovs": by_mitsuba})
+        if self.no_expressions and (self._list.expressions or self._list.groups):
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
+                f"render, because {self.no_expressions}"
+            )
+        self._groups: list[str] | None = None
+        self._channels: PathChannels | None = None
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -214,7 +233,7 @@ class WalkIntegrator(StagedIntegrator):
         weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene),
-            **self.clamps,
+            **self.clamps, channels=self._channels,
         )  # fmt: skip
         return Stage(walk, weight=weight)
 
@@ -320,7 +339,7 @@ class WalkIntegrator(StagedIntegrator):
         observed = {} if observer is None else {"observer": observer}
         return Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed,
-            **self.clamps,
+            **self.clamps, channels=self._channels,
         )  # fmt: skip
 
     # ---- What Mitsuba calls ----
@@ -349,19 +368,33 @@ class WalkIntegrator(StagedIntegrator):
         setting = Setting(
             scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
         )
+        self.look_at(scene)
         walk = self.walk(decisions_of(self.slots, setting, Decisions(query=self.query(scene))))
         sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
-        return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
+        return sample.L, sample.valid, sample.aovs + self.sample_aovs(scene, sampler, ray)
+
+    def look_at(self, scene):
+        if not (self._list.expressions or self._list.groups):
+            return
+        self._groups = light_groups(scene)
+        expressions = self._list.of_groups(self._groups)
+        try:
+            self._channels = PathChannels(scene, list(expressions.values()))
+        except ValueError as error:
+            raise ValueError(f'"{self.name}": the parameter "aovs": {error}') from None
 
     def aov_names(self) -> list[str]:
-        return self._aovs.aov_names() if self._aovs else []
+        names = self._list.of_groups(self._known_groups()).keys()
+        channels = [f"{name}.{colour}" for name in names for colour in "RGB"]
+        return channels + (self._aovs.aov_names() if self._aovs else [])
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
-        """The values of the channels that :meth:`aov_names` names."""
+        """The values of the channels that :meth:`aov_names` names, without the channels of light
+        path expressions."""
         if self._aovs is None:
             return []
         if has_unseen_shapes(scene):
-            return output_variables(self._aovs, self.aovs, scene, sampler, ray)
+            return output_variables(self._aovs, self._list.by_mitsuba, scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
@@ -414,6 +447,14 @@ class WalkIntegrator(StagedIntegrator):
         refuse_moving_grids(scene, f'"{self.name}"')
         refuse_missing_colours(scene, f'"{self.name}"')
 
-    def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
-        check_aovs(self.name, aovs)
-        return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None
+    def _known_groups(self) -> list[str]:
+        """The light groups of the scene, if the channels need them."""
+        if not self._list.groups:
+            return []
+        if self._groups is None:
+            raise ValueError(
+                f'"{self.name}": "{self._list.groups[0]}:light_groups" in "aovs" has a channel for '
+                f"each group of a scene, which is not known here: write a channel for each group "
+                f"instead, such as \"key:C.*<L.'key'>\""
+            )
+        return self._groups

@@ -106,6 +106,10 @@ class WrappingIntegrator(StagedIntegrator):
         self.check_sampled()
         return self.nested.sample(scene, sampler, ray, medium, active)
 
+    def look_at(self, scene):
+        if self._is_staged:
+            self.nested.look_at(scene)
+
     def aov_names(self) -> list[str]:
         return self.nested.aov_names()
 

@@ -1,10 +1,15 @@
-"""Checks lists of arbitrary output variables before Mitsuba's ``aov`` reads them: an item without a
-type makes Mitsuba 3.9.1 crash (a segmentation fault)."""
+"""Lists of arbitrary output variables: the types of Mitsuba's ``aov``, light path expressions, and
+light groups. Lists are checked before Mitsuba reads them: an item without a type makes Mitsuba
+3.9.1 crash (a segmentation fault)."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from ..util.errors import did_you_mean
+from .expressions.notation import Expression, ExpressionError
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -15,9 +20,109 @@ AOV_TYPES = (
     "duv_dy", "prim_index", "shape_index",
 )  # fmt: skip
 
+#: The named passes, and the expressions for which they stand. The parts of the first event add up
+#: to the image (``emission``, ``diffuse``, ``glossy``, ``transmission``, ``volume``), and so do
+#: ``emission``, ``direct`` and ``indirect``.
+PASSES = {
+    "emission": "CL",
+    "direct": "C.L",
+    "indirect": "C..+L",
+    "diffuse": "C<RD>.*L",
+    "glossy": "C<R[GS]>.*L",
+    "transmission": "C<T.>.*L",
+    "volume": "CV.*L",
+    "caustics": "C.*D[GS]+L",
+}
+
+#: The type that stands for a channel for each light group.
+LIGHT_GROUPS = "light_groups"
+
+
+@dataclass(frozen=True)
+class Aovs:
+    """A list of output variables.
+
+    Attributes:
+        by_mitsuba: The items that Mitsuba's ``aov`` computes, as a list for it.
+        expressions: The light path expressions, by the names of their channels.
+        groups: The names of the items that stand for all light groups.
+    """
+
+    by_mitsuba: str = ""
+    expressions: dict[str, Expression] = field(default_factory=dict)
+    groups: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, plugin: str, aovs: str) -> Aovs:
+        """Reads a list, ``name:type,name:type``. Commas and spaces separate the items, except
+        within quotes and brackets.
+
+        Parameters:
+            plugin: The plugin that has the parameter ``aovs``.
+
+        Raises:
+            ValueError: An item does not have this form, its type is unknown, its expression has a
+                syntax error, or two items have the same name.
+        """
+        by_mitsuba, expressions, groups = [], {}, []
+        names: set[str] = set()
+        for item in _items(aovs):
+            name, _colon, kind = item.partition(":")
+            is_word = re.fullmatch(r"[a-z_]*", kind) is not None
+            if not name or (is_word and kind not in (*AOV_TYPES, *PASSES, LIGHT_GROUPS)):
+                raise ValueError(_message(plugin, item, (*AOV_TYPES, *PASSES, LIGHT_GROUPS)))
+            if name in names:
+                raise ValueError(f'"{plugin}": two items of "aovs" have the name "{name}"')
+            names.add(name)
+            if kind in AOV_TYPES:
+                by_mitsuba.append(item)
+            elif kind == LIGHT_GROUPS:
+                groups.append(name)
+            else:
+                expressions[name] = _expression(plugin, PASSES.get(kind, kind))
+        return cls(",".join(by_mitsuba), expressions, tuple(groups))
+
+    def of_groups(self, groups: list[str]) -> dict[str, Expression]:
+        """All expressions: also those of the items for light groups, for these groups."""
+        found = dict(self.expressions)
+        for name in self.groups:
+            for group in groups:
+                found[f"{name}.{group}"] = Expression.parse(f"C.*<L.'{group}'>")
+        return found
+
+
+def _items(aovs: str) -> list[str]:
+    """The items of a list."""
+    items, item, depth, quoted = [], "", 0, False
+    for character in aovs:
+        quoted ^= character == "'"
+        if not quoted:
+            depth += (character in "<[({") - (character in ">])}")
+        if character in ", \n\t" and depth <= 0 and not quoted:
+            items.append(item)
+            item = ""
+        else:
+            item += character
+    return [item for item in (*items, item) if item]
+
+
+def _expression(plugin: str, text: str) -> Expression:
+    from .expressions.alphabet import can_be_met
+
+    try:
+        expression = Expression.parse(text)
+    except ExpressionError as error:
+        raise ValueError(f'"{plugin}": the parameter "aovs": {error}') from None
+    if not can_be_met(expression):
+        raise ValueError(
+            f'"{plugin}": the parameter "aovs": no path belongs to the expression "{text}": a path '
+            f"begins with C (the camera) and ends with L (a light), as in C<RD>.*L"
+        )
+    return expression
+
 
 def check_aovs(plugin: str, aovs: str) -> None:
-    """Checks a list of output variables, ``name:type,name:type``.
+    """Checks a list of output variables for Mitsuba's ``aov``, ``name:type,name:type``.
 
     Args:
         plugin: The plugin that has the parameter ``aovs``.
@@ -29,10 +134,15 @@ def check_aovs(plugin: str, aovs: str) -> None:
     for item in filter(None, re.split("[, ]", aovs)):  # as Mitsuba splits it
         name, _colon, kind = item.partition(":")
         if not name or kind not in AOV_TYPES:
-            raise ValueError(
-                f'"{plugin}": the parameter "aovs" must be a list of name:type, such as '
-                f'"d:depth,n:sh_normal", and not "{item}"; the types are {", ".join(AOV_TYPES)}'
-            )
+            raise ValueError(_message(plugin, item, AOV_TYPES))
+
+
+def _message(plugin: str, item: str, types: tuple[str, ...]) -> str:
+    return (
+        f'"{plugin}": the parameter "aovs" must be a list of name:type, such as '
+        f'"d:depth,n:sh_normal", and not "{item}"; the types are {", ".join(types)}'
+        f'{did_you_mean(item.partition(":")[2], types)}'
+    )
 
 
 def check_nodes(state: mi.parser.ParserState) -> None:
