@@ -189,6 +189,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """Makes what the channels of :meth:`aov_names` need to know of a scene. A render calls it
         first."""
 
+    @property
+    def has_ray_aovs(self) -> bool:
+        """Whether :meth:`sample_aovs` returns any channels."""
+        return bool(self.aov_names())
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names; none by default."""
         return []

@@ -388,6 +388,11 @@ class WalkIntegrator(StagedIntegrator):
         channels = [f"{name}.{colour}" for name in names for colour in "RGB"]
         return channels + (self._aovs.aov_names() if self._aovs else [])
 
+    @property
+    def has_ray_aovs(self) -> bool:
+        of_expressions = 3 * len(self._list.of_groups(self._known_groups()))
+        return len(self.aov_names()) > of_expressions
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names, without the channels of light
         path expressions."""

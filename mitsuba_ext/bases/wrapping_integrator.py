@@ -113,6 +113,10 @@ class WrappingIntegrator(StagedIntegrator):
     def aov_names(self) -> list[str]:
         return self.nested.aov_names()
 
+    @property
+    def has_ray_aovs(self) -> bool:
+        return super().has_ray_aovs and (not self._is_staged or self.nested.has_ray_aovs)
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []
 

@@ -316,7 +316,7 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if not self.freezes_passes or self.integrator.aov_names():
+        if not self.freezes_passes or self.integrator.has_ray_aovs:
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False

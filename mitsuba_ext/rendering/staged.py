@@ -60,6 +60,10 @@ class Staged(Protocol):
     def aov_names(self) -> list[str]:
         """Channels besides colour and alpha."""
 
+    @property
+    def has_ray_aovs(self) -> bool:
+        """Whether :meth:`sample_aovs` has any."""
+
     def sample_aovs(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
     ) -> list[mi.Float]:

@@ -81,7 +81,14 @@ class PathChannels:
         self._mixes = self._sees_lobes and mixes_lobes(scene)
         self._undivided = undivided_bsdfs(scene) if self._mixes else None
         self._ctx = Heroes(scene).context()
-        self._lane, self._sums = mi.UInt32(0), mi.Spectrum(0)
+        self._lane, self._sums = mi.UInt32(0), _Sums(1)
+
+    def kernel_state(self) -> tuple:
+        """The attributes that kernels depend on; a pass makes the others."""
+        return (
+            self._names, self._surface_class, self._symbols, self._lights, self._next, self._ends,
+            self._of, self._cells, self._reads, self._sees_lobes, self._mixes, self._undivided,
+        )  # fmt: skip
 
     # ---- Along a path ----
 
@@ -89,7 +96,7 @@ class PathChannels:
         """The state before the first vertex."""
         lanes = dr.width(rays.ray)
         self._lane = dr.arange(mi.UInt32, lanes)
-        self._sums = dr.zeros(mi.Spectrum, lanes * self._cells)
+        self._sums = _Sums(lanes * self._cells)
         colours = len(mi.UnpolarizedSpectrum()) if self._mixes else 1
         return [mi.UInt32(0) for _ in range(colours)]
 
@@ -125,8 +132,7 @@ class PathChannels:
         """The channels of each path: red, green and blue of the first expression, and so on. The
         kernel of the walk must have run."""
         parts = [
-            dr.gather(mi.Spectrum, self._sums, self._lane * self._cells + cell)
-            for cell in range(self._cells)
+            self._sums.at(self._lane * self._cells + cell) for cell in range(self._cells)
         ]
         found = []
         for cells in self._of:
@@ -197,13 +203,46 @@ class PathChannels:
         self._add(cells, value, active)
 
     def _add(self, cells: list[mi.UInt32], value: mi.Spectrum, active) -> None:
-        first = self._lane * self._cells - 1
+        """Adds a value to cells: to one, or each colour to its own."""
         active = active & (dr.max(dr.abs(value)) > 0)
-        if len(cells) == 1:
-            add_own(self._sums, value, first + cells[0], active & (cells[0] > 0))
+        for index, cell in enumerate(cells):
+            # Colours mostly share a cell, and are added at once
+            shares = [other == cell for other in cells]
+            is_first = active & (cell > 0)
+            for earlier in cells[:index]:
+                is_first &= earlier != cell
+            words = [dr.select(share, part, 0) for share, part in zip(shares, value)]
+            if len(cells) == 1:
+                words = list(value)
+            self._sums.add(self._lane * self._cells + cell - 1, words, is_first)
+
+
+class _Sums:
+    """Sums of spectra, each of which belongs to one lane. They lie in packets of four numbers,
+    which Dr.Jit reads and writes at once, in a quarter of the time.
+
+    Parameters:
+        count: The number of sums.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._packet = 1 if len(mi.Spectrum()) == 1 else 4
+        self._words = dr.zeros(mi.Float, count * self._packet)
+
+    def add(self, index: mi.UInt32, words: list[mi.Float], active: mi.Bool) -> None:
+        """Adds a spectrum."""
+        if self._packet == 1:
+            add_own(self._words, words[0], index, active)
             return
-        for cell, target, part in zip(cells, self._sums, value):
-            add_own(target, part, first + cell, active & (cell > 0))
+        words = words + [mi.Float(0)] * (self._packet - len(words))
+        add_own(self._words, mi.Vector4f(*words), index, active)
+
+    def at(self, index: mi.UInt32) -> mi.Spectrum:
+        """The sums with these indices."""
+        if self._packet == 1:
+            return mi.Spectrum(dr.gather(mi.Float, self._words, index))
+        words = dr.gather(mi.Vector4f, self._words, index)
+        return mi.Spectrum(*(words[k] for k in range(len(mi.Spectrum()))))
 
 
 def _looked_up(table: mi.UInt32, pointer: Any) -> mi.UInt32:
