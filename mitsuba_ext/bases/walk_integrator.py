@@ -93,6 +93,7 @@ class WalkIntegrator(StagedIntegrator):
             ends a sentence in an error message.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
+        channels (PathChannels): The light path expressions of the render; ``None`` without any.
     """
 
     has_light_paths = light_paths_see_media = can_clamp = False
@@ -117,7 +118,7 @@ class WalkIntegrator(StagedIntegrator):
                 f"render, because {self.no_expressions}"
             )
         self._groups: list[str] | None = None
-        self._channels: PathChannels | None = None
+        self.channels: PathChannels | None = None
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -233,7 +234,7 @@ class WalkIntegrator(StagedIntegrator):
         weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene),
-            **self.clamps, channels=self._channels,
+            **self.clamps, channels=self.channels,
         )  # fmt: skip
         return Stage(walk, weight=weight)
 
@@ -339,7 +340,7 @@ class WalkIntegrator(StagedIntegrator):
         observed = {} if observer is None else {"observer": observer}
         return Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed,
-            **self.clamps, channels=self._channels,
+            **self.clamps, channels=self.channels,
         )  # fmt: skip
 
     # ---- What Mitsuba calls ----
@@ -379,7 +380,7 @@ class WalkIntegrator(StagedIntegrator):
         self._groups = light_groups(scene)
         expressions = self._list.of_groups(self._groups)
         try:
-            self._channels = PathChannels(scene, list(expressions.values()))
+            self.channels = PathChannels(scene, list(expressions.values()))
         except ValueError as error:
             raise ValueError(f'"{self.name}": the parameter "aovs": {error}') from None
 

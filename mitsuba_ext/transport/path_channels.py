@@ -31,6 +31,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..scene.bsdfs import mixes_lobes, undivided_bsdfs
 from ..scene.expressions.alphabet import PER_CLASS, STRAIGHT, VOLUME, Alphabet
@@ -68,10 +69,14 @@ class PathChannels:
         self._symbols, self._lights = len(alphabet.vertices), len(alphabet.lights)
         self._next = from_numpy(mi.UInt32, automaton.next)
         self._ends = from_numpy(mi.UInt32, automaton.ends)
+        self._begins = from_numpy(mi.UInt32, automaton.begins)
+        self._back = from_numpy(mi.UInt32, automaton.back)
+        self._pairs, self._backs = from_numpy(mi.UInt32, automaton.pairs), len(automaton.back)
         # The cells of each expression; cell 0 is not stored
         cells = list(enumerate(automaton.cells))[1:]
         self._of = [[i - 1 for i, c in cells if k in c] for k in range(len(expressions))]
         self._cells = max(1, len(cells))
+        self._accepts = from_numpy(mi.UInt32, _masks(automaton.cells, len(expressions)))
         self._reads = len(automaton.next) > 1
         classes = range(0, self._symbols, PER_CLASS)
         self._sees_lobes = any(
@@ -88,6 +93,7 @@ class PathChannels:
         return (
             self._names, self._surface_class, self._symbols, self._lights, self._next, self._ends,
             self._of, self._cells, self._reads, self._sees_lobes, self._mixes, self._undivided,
+            self._begins, self._back, self._pairs, self._backs, self._accepts,
         )  # fmt: skip
 
     # ---- Along a path ----
@@ -97,8 +103,12 @@ class PathChannels:
         lanes = dr.width(rays.ray)
         self._lane = dr.arange(mi.UInt32, lanes)
         self._sums = _Sums(lanes * self._cells)
-        colours = len(mi.UnpolarizedSpectrum()) if self._mixes else 1
-        return [mi.UInt32(0) for _ in range(colours)]
+        return [mi.UInt32(0) for _ in range(self.colours)]
+
+    @property
+    def colours(self) -> int:
+        """The number of states of a path."""
+        return len(mi.UnpolarizedSpectrum()) if self._mixes else 1
 
     def emitted(
         self, path: PathState, emitter: mi.EmitterPtr, value: mi.Spectrum, active: mi.Bool
@@ -119,14 +129,20 @@ class PathChannels:
         """The state behind ``vertex``, in the direction ``bs`` that was sampled there."""
         if not self._reads:
             return vertex.path.events
+        return self._behind(vertex, self._sampled(vertex, bs, bs.wo))
+
+    def _sampled(
+        self, vertex: Vertex, bs: mi.BSDFSample3f, wo: mi.Vector3f
+    ) -> list[mi.UInt32]:
+        """The symbol that each colour reads at a vertex, for the lobe that ``bs`` is from."""
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         symbols = []
-        for kind in self._chosen(vertex, bs.wo, ~is_delta):
+        for kind in self._chosen(vertex, wo, ~is_delta):
             kind = dr.select(is_delta, mi.UInt32(_SPECULAR), kind)
-            symbol = self._symbol(vertex, bs.wo, kind)
+            symbol = self._symbol(vertex, wo, kind)
             symbols.append(dr.select(is_straight, mi.UInt32(STRAIGHT), symbol))
-        return self._behind(vertex, symbols)
+        return symbols
 
     def values(self, rays: CameraRays) -> list[mi.Float]:
         """The channels of each path: red, green and blue of the first expression, and so on. The
@@ -138,6 +154,74 @@ class PathChannels:
         for cells in self._of:
             total = sum((parts[cell] for cell in cells), mi.Spectrum(0))
             found += list(to_rgb(total * rays.importance, rays.ray.wavelengths))
+        return found
+
+    # ---- Along a light path ----
+
+    def begin_light(self, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
+        """The state of the backward automaton behind a light."""
+        state = dr.gather(mi.UInt32, self._begins, _looked_up(self._names, emitter))
+        return [mi.UInt32(state) for _ in range(self.colours)]
+
+    def left_by_light(self, vertex: Vertex, bs: mi.BSDFSample3f) -> list[mi.UInt32]:
+        """The state of a light path behind ``vertex``, in the direction ``bs`` that was sampled
+        there."""
+        if self._backs == 1:
+            return vertex.path.events
+        return self._before(vertex, self._sampled(_reversed(vertex, bs.wo), bs, vertex.si.wi))
+
+    def past(
+        self, vertex: Any, to_camera: mi.Vector3f, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The state of a light path behind its last ``vertex``, in the direction in which it is
+        connected. ``vertex`` is a stored one, on a surface."""
+        path = PathState(*[None] * 6, events=vertex.events)
+        at = Vertex(vertex.si, vertex.si.bsdf(), path)
+        if self._backs == 1:
+            return vertex.events
+        reverse, wo = _reversed(at, to_camera), vertex.si.wi
+        kinds = self._chosen(reverse, wo, active)
+        return self._before(at, [self._symbol(reverse, wo, kind) for kind in kinds])
+
+    def joined(
+        self,
+        vertex: Vertex,
+        wo: mi.Vector3f,
+        others: list[mi.UInt32],
+        value: mi.Spectrum,
+        active: mi.Bool,
+    ) -> None:
+        """The path gains ``value`` from light paths with the states ``others``, whose light arrives
+        at ``vertex`` from the local direction ``wo``."""
+        for kind, share in self._parts(vertex, wo, active):
+            states = self._behind(vertex, [self._symbol(vertex, wo, kind)])
+            self._add(self._met(states, others), value * share, active)
+
+    def joined_in_medium(
+        self, path: PathState, others: list[mi.UInt32], value: mi.Spectrum, active: mi.Bool
+    ) -> None:
+        """As :meth:`joined`, at a point of a medium on the way to the next vertex of ``path``."""
+        states = path.events
+        if self._reads:
+            states = [
+                dr.gather(mi.UInt32, self._next, state * self._symbols + VOLUME)
+                for state in states
+            ]
+        self._add(self._met(states, others), value, active)
+
+    def splatted(self, others: list[mi.UInt32], value: mi.Spectrum) -> list[mi.Spectrum]:
+        """The part of ``value`` that each channel gains where light paths with the states
+        ``others`` reach the sensor."""
+        cells = self._met([mi.UInt32(0)] * len(others), others)
+        found = []
+        for index in range(len(self._of)):
+            word = -(-len(self._of) // 32)
+            parts = [
+                (dr.gather(mi.UInt32, self._accepts, c * word + index // 32) >> index % 32) & 1
+                for c in cells
+            ]
+            parts = parts * len(value) if len(parts) < len(value) else parts
+            found.append(mi.Spectrum(*(dr.select(p == 1, v, 0) for p, v in zip(parts, value))))
         return found
 
     # ---- Symbols ----
@@ -196,6 +280,23 @@ class PathChannels:
             for state, symbol in zip(states, symbols)
         ]
 
+    def _before(self, vertex: Vertex, symbols: list[mi.UInt32]) -> list[mi.UInt32]:
+        """The states of the backward automaton behind a vertex of a light path."""
+        states = vertex.path.events
+        if len(symbols) < len(states):
+            symbols = symbols * len(states)
+        return [
+            dr.gather(mi.UInt32, self._back, state * self._symbols + symbol)
+            for state, symbol in zip(states, symbols)
+        ]
+
+    def _met(self, states: list[mi.UInt32], others: list[mi.UInt32]) -> list[mi.UInt32]:
+        """The cells of paths that are joined from two subpaths."""
+        return [
+            dr.gather(mi.UInt32, self._pairs, state * self._backs + other)
+            for state, other in zip(states, others)
+        ]
+
     def _end(self, states: list[mi.UInt32], emitter, value: mi.Spectrum, active) -> None:
         """Adds the light of a path that ends at ``emitter``."""
         light = _looked_up(self._names, emitter)
@@ -243,6 +344,22 @@ class _Sums:
             return mi.Spectrum(dr.gather(mi.Float, self._words, index))
         words = dr.gather(mi.Vector4f, self._words, index)
         return mi.Spectrum(*(words[k] for k in range(len(mi.Spectrum()))))
+
+
+def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:
+    """A vertex of a light path, as a camera path sees it that arrives from ``to_camera``."""
+    si = mi.SurfaceInteraction3f(vertex.si)
+    si.wi = to_camera
+    return Vertex(si, vertex.bsdf, vertex.path, None, vertex.medium)
+
+
+def _masks(cells: Sequence[frozenset[int]], count: int) -> np.ndarray:
+    """A bit for each of ``count`` expressions, which tells whether it has a cell; 32 bits a word."""
+    masks = np.zeros((len(cells), -(-count // 32)), np.uint32)
+    for row, cell in zip(masks, cells):
+        for index in cell:
+            row[index // 32] |= np.uint32(1 << index % 32)
+    return masks
 
 
 def _looked_up(table: mi.UInt32, pointer: Any) -> mi.UInt32:
