@@ -22,6 +22,7 @@ from .common import INTERRUPTED, say
 from .compare import compare
 from .completion import completion, register
 from .denoise import denoise
+from .relight import relight
 from .diff import diff
 from .export_blender import export_blender
 from .merge import merge
@@ -52,8 +53,8 @@ def doctor() -> int:
 
 
 for command in (
-    render, view, merge, denoise, compare, diff, replay, list_plugins, doctor, export_blender,
-    completion,
+    render, view, merge, denoise, relight, compare, diff, replay, list_plugins, doctor,
+    export_blender, completion,
 ):  # fmt: skip
     cli.add_command(command)
 
