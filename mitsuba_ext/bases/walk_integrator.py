@@ -34,7 +34,7 @@ from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.observer import Observer
-from ..transport.path_channels import PathChannels
+from ..transport.path_channels import PathChannels, colour_names
 from ..transport.path_decisions import SceneQuery
 from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
@@ -386,12 +386,13 @@ class WalkIntegrator(StagedIntegrator):
 
     def aov_names(self) -> list[str]:
         names = self._list.of_groups(self._known_groups()).keys()
-        channels = [f"{name}.{colour}" for name in names for colour in "RGB"]
+        channels = [f"{name}.{colour}" for name in names for colour in colour_names()]
         return channels + (self._aovs.aov_names() if self._aovs else [])
 
     @property
     def has_ray_aovs(self) -> bool:
-        of_expressions = 3 * len(self._list.of_groups(self._known_groups()))
+        names = self._list.of_groups(self._known_groups())
+        of_expressions = len(names) * len(colour_names())
         return len(self.aov_names()) > of_expressions
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:

@@ -22,11 +22,11 @@ from .common import INTERRUPTED, say
 from .compare import compare
 from .completion import completion, register
 from .denoise import denoise
-from .relight import relight
 from .diff import diff
 from .export_blender import export_blender
 from .merge import merge
 from .plugins import list_plugins
+from .relight import relight
 from .render import render
 from .replay import replay
 from .supervisor import SUPERVISED

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
+from ..transport.path_channels import film_colours
 from ..util.spectra import to_rgb
 
 
@@ -325,7 +326,7 @@ def put_splats(film: mi.Film, block: mi.ImageBlock, splats: Splats) -> None:
     values = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
     values.append(mi.Float(0))
     for part in splats.channels:
-        values.extend(to_rgb(part, splats.wavelengths))
+        values += film_colours(part, splats.wavelengths)
     values += [mi.Float(0)] * (block.channel_count() - len(values))
     block.put(splats.position, values, splats.active)
 

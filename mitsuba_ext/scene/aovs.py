@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..util.errors import did_you_mean
-from .expressions.notation import Expression, ExpressionError
+from .expressions.notation import Expression
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -111,9 +111,10 @@ def _expression(plugin: str, text: str) -> Expression:
 
     try:
         expression = Expression.parse(text)
-    except ExpressionError as error:
+        is_possible = can_be_met(expression)
+    except ValueError as error:
         raise ValueError(f'"{plugin}": the parameter "aovs": {error}') from None
-    if not can_be_met(expression):
+    if not is_possible:
         raise ValueError(
             f'"{plugin}": the parameter "aovs": no path belongs to the expression "{text}": a path '
             f"begins with C (the camera) and ends with L (a light), as in C<RD>.*L"

@@ -11,11 +11,11 @@ pair alone: it is the share of the diffuse lobes in the value of the BSDF
 (:func:`.bsdfs.diffuse_share`), for each colour.
 
 - A connection is divided by this share, and added to two cells.
-- A sampled direction cannot be divided: the path goes on with one state. It chooses one: each colour
-  takes ``D`` with the probability of its share, and otherwise ``G``. All colours use the same random
-  number. The expected channel is the same as if the path had been divided, each colour has its full
-  value in one of the channels, and MIS weights are right because the probability is a function of
-  the two directions.
+- A sampled direction cannot be divided: the path goes on with one state. It chooses one. Each
+  colour takes ``D`` with the probability of its share, and otherwise ``G``. All colours use the same
+  random number. The expected channel is the same as if the path had been divided, each colour has
+  its full value in one of the channels, and MIS weights are right because the probability is a
+  function of the two directions.
 
 Channels are thus what a scene without the other lobes would show, with the same sampling, and a
 partition of all paths adds up to the image, sample by sample.
@@ -145,15 +145,15 @@ class PathChannels:
         return symbols
 
     def values(self, rays: CameraRays) -> list[mi.Float]:
-        """The channels of each path: red, green and blue of the first expression, and so on. The
-        kernel of the walk must have run."""
+        """The channels of each path: the colours of the first expression, and so on. The kernel of
+        the walk must have run."""
         parts = [
             self._sums.at(self._lane * self._cells + cell) for cell in range(self._cells)
         ]
         found = []
         for cells in self._of:
             total = sum((parts[cell] for cell in cells), mi.Spectrum(0))
-            found += list(to_rgb(total * rays.importance, rays.ray.wavelengths))
+            found += film_colours(total * rays.importance, rays.ray.wavelengths)
         return found
 
     # ---- Along a light path ----
@@ -346,6 +346,16 @@ class _Sums:
         return mi.Spectrum(*(words[k] for k in range(len(mi.Spectrum()))))
 
 
+def colour_names() -> str:
+    """The letters of the colours that an expression has in the film."""
+    return "Y" if mi.is_monochromatic else "RGB"
+
+
+def film_colours(value: mi.Spectrum, wavelengths: mi.Spectrum | None) -> list[mi.Float]:
+    """The values of these colours."""
+    return list(to_rgb(value, wavelengths))[: len(colour_names())]
+
+
 def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:
     """A vertex of a light path, as a camera path sees it that arrives from ``to_camera``."""
     si = mi.SurfaceInteraction3f(vertex.si)
@@ -354,7 +364,7 @@ def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:
 
 
 def _masks(cells: Sequence[frozenset[int]], count: int) -> np.ndarray:
-    """A bit for each of ``count`` expressions, which tells whether it has a cell; 32 bits a word."""
+    """A bit for each of ``count`` expressions: whether it has a cell. A word has 32 bits."""
     masks = np.zeros((len(cells), -(-count // 32)), np.uint32)
     for row, cell in zip(masks, cells):
         for index in cell:

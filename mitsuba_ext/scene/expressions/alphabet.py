@@ -68,7 +68,8 @@ class Alphabet:
                 raise ValueError(
                     f'the expression "{expression.text}" has the label "{label}", but no light, '
                     f"shape or BSDF of the scene has this name"
-                    f"{did_you_mean(label, known) or _listed(known)}"
+                    f"{did_you_mean(label, known) or _listed(known)}. Mitsuba merges meshes of one "
+                    f"BSDF when it loads a scene: name the BSDF, or load it with optimize=False"
                 )
         lights = [Symbol(_light_types(e), "", _light_labels(e) & labels) for e in emitters]
         symbols = sorted(set(lights), key=lambda s: (s.types, sorted(s.labels))) or LIGHTS

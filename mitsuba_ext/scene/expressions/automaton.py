@@ -27,11 +27,17 @@ from .notation import Alternatives, Expression, OneOf, Repetition, Symbol, Tree
 from .notation import Sequence as InSequence
 
 #: The largest number of states of a deterministic automaton.
-MOST_STATES = 1 << 12
+MOST_STATES = 1 << 10
 
 
 class TooManyStatesError(ValueError):
     """The expressions need too many states."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            f"the light path expressions need an automaton of more than {MOST_STATES} states: "
+            f"repeat less often with braces, or render fewer expressions at once"
+        )
 
 
 @dataclass
@@ -243,7 +249,7 @@ def _explored(
                 number[states] = len(found)
                 found.append(states)
                 if len(found) > MOST_STATES:
-                    raise TooManyStatesError
+                    raise TooManyStatesError()
             row.append(number[states])
         rows.append(row)
     return found, np.array(rows, np.uint32).reshape(len(found), len(symbols))
