@@ -2,19 +2,19 @@
 its events, and what it gains is added to the cell that the automaton names
 (``scene/expressions``).
 
-**What an event is.** Media scatter with ``V``. At a surface, the two directions give the type: ``R``
-if they are on one side of the surface, otherwise ``T``. The lobe gives the scattering. Delta lobes
-(``S``, or ``s`` where light goes straight on) are found by sampling only, so that the lobe is known.
-Other lobes are not told apart by sampling: a connection evaluates all of them together, and MIS
-weights are for the sum. What is diffuse about a pair of directions must therefore follow from this
-pair alone: it is the share of the diffuse lobes in the value of the BSDF
+**What an event is.** Media scatter with ``V``. At a surface, the two directions give the type:
+``R`` if they are on one side of the surface, otherwise ``T``. The lobe gives the scattering. Delta
+lobes (``S``, or ``s`` where light goes straight on) are found by sampling only, so that the lobe is
+known. Other lobes are found in two ways: by sampling, and by connections, which evaluate all lobes
+together. MIS weights are for the sum of the lobes. What is diffuse about a pair of directions must
+therefore follow from this pair alone: it is the share of the diffuse lobes in the value of the BSDF
 (:func:`.bsdfs.diffuse_share`), for each colour.
 
 - A connection is divided by this share, and added to two cells.
 - A sampled direction cannot be divided: the path goes on with one state. It chooses one. Each
-  colour takes ``D`` with the probability of its share, and otherwise ``G``. All colours use the same
-  random number. The expected channel is the same as if the path had been divided, each colour has
-  its full value in one of the channels, and MIS weights are right because the probability is a
+  colour takes ``D`` with the probability of its share, and otherwise ``G``. All colours use the
+  same random number. The expected channel is the same as if the path had been divided, each colour
+  has its full value in one of the channels, and MIS weights are right because the probability is a
   function of the two directions.
 
 Channels are thus what a scene without the other lobes would show, with the same sampling, and a

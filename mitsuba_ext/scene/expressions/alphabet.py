@@ -75,7 +75,8 @@ class Alphabet:
         symbols = sorted(set(lights), key=lambda s: (s.types, sorted(s.labels))) or LIGHTS
         pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
         light_class = _table(pointers, [symbols.index(light) for light in lights])
-        classes = [frozenset(), *sorted({n & labels for _s, n in named} - {frozenset()}, key=sorted)]
+        found = {names & labels for _shape, names in named} - {frozenset()}
+        classes = [frozenset(), *sorted(found, key=sorted)]
         surface_class = None
         if len(classes) > 1:
             surface_class = _table(

@@ -46,8 +46,9 @@ def _render(scene: mi.Scene, aovs: str, name: str = "composed_path", spp: int = 
 def test_a_partition_adds_up_to_the_image_which_is_the_same_as_without_channels() -> None:
     scene = _box()
     plain, _ = _render(scene, "")
-    image, channels = _render(scene, PARTITION)
+    image, channels = _render(scene, PARTITION + ",ts:C<TS>.*L")
     np.testing.assert_allclose(image, plain, atol=2e-5)
+    np.testing.assert_array_equal(channels.pop("ts"), channels["tr"])
     np.testing.assert_allclose(sum(channels.values()), image, atol=2e-5)
     assert all(channels[name].mean() > 1e-3 for name in ("em", "di", "gl", "tr"))
     assert not channels["vo"].any()
@@ -71,7 +72,7 @@ def test_both_ways_to_find_a_light_agree_on_the_channel() -> None:
         },
         "floor": {
             "type": "rectangle",
-            "bsdf": {"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": _CREAM},
+            "bsdf": {"type": "roughplastic", "alpha": 0.6, "diffuse_reflectance": _CREAM},
         },
         "lamp": {
             "type": "rectangle", "to_world": lamp, "emitter": {"type": "area", "radiance": 5.0},
@@ -79,14 +80,14 @@ def test_both_ways_to_find_a_light_agree_on_the_channel() -> None:
         "sky": {"type": "constant", "radiance": 0.5},
     })  # fmt: skip
     channels = {
-        mis: _render(scene, "di:C<RD>L,gl:C<RG>L", spp=2048, mis=mis)[1]
+        mis: _render(scene, "di:C<RD>L,gl:C<RG>L", spp=4096, mis=mis)[1]
         for mis in ("power", "light", "bsdf")
     }
     for name in ("di", "gl"):
         expected = channels["power"][name].mean((0, 1))
         for mis in ("light", "bsdf"):
             found = channels[mis][name].mean((0, 1))
-            np.testing.assert_allclose(found, expected, rtol=0.03, err_msg=f"{mis} {name}")
+            np.testing.assert_allclose(found, expected, rtol=0.04, err_msg=f"{mis} {name}")
 
 
 @pytest.mark.parametrize(
