@@ -112,7 +112,7 @@ class WalkIntegrator(StagedIntegrator):
         self._aovs: mi.Integrator | None = None
         if by_mitsuba := self._list.by_mitsuba:
             self._aovs = mi.load_dict({"type": "aov", "aovs": by_mitsuba})
-        if self.no_expressions and (self._list.expressions or self._list.groups):
+        if self.no_expressions and self.has_expressions:
             raise NotImplementedError(
                 f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
                 f"render, because {self.no_expressions}"
@@ -374,8 +374,13 @@ class WalkIntegrator(StagedIntegrator):
         sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
         return sample.L, sample.valid, sample.aovs + self.sample_aovs(scene, sampler, ray)
 
+    @property
+    def has_expressions(self) -> bool:
+        """Whether ``aovs`` has light path expressions, passes or light groups."""
+        return bool(self._list.expressions or self._list.groups)
+
     def look_at(self, scene):
-        if not (self._list.expressions or self._list.groups):
+        if not self.has_expressions:
             return
         self._groups = light_groups(scene)
         expressions = self._list.of_groups(self._groups)
