@@ -1,10 +1,10 @@
 """Light groups: names under which the lights of a scene are rendered to channels of their own.
 
 A light belongs to the group that the string ``light_group`` names, on the emitter or its shape.
-Mitsuba refuses strings that no plugin reads: our loader (the command line,
-:func:`mitsuba_ext.load_scene`) moves them into the id of the emitter. Without it, ids are the names
-of groups, up to the first dot: the lights ``key.001`` and ``key.002`` are in the group ``key``. The
-id of a light with a surface is the id of its shape.
+Mitsuba refuses strings that no plugin reads: our loader (the command line, and
+:func:`mitsuba_ext.compare.load_scene`) moves them into the id of the emitter. Without it, ids are
+the names of groups, up to the first dot: the lights ``key.001`` and ``key.002`` are in the group
+``key``. The id of a light with a surface is the id of its shape.
 """
 
 from __future__ import annotations
