@@ -67,6 +67,8 @@ class FixedSchedule(Schedule):
 class TwoStages:
     """Two stages of constants: a pilot worth 1 and a rest worth 3."""
 
+    has_ray_aovs = False
+
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.is_cancelled = False

@@ -190,10 +190,9 @@ class _Parser:
         if self._skip(","):
             most = None if self._next == "}" else self._count()
         self._expect("}")
-        if most is not None and most < max(least, 1):
+        if most is not None and most < least:
             self._place = start
-            raise self._error("the largest number of repetitions must be 1 or more, and not less "
-                              "than the smallest")  # fmt: skip
+            raise self._error("the largest number of repetitions is less than the smallest")
         return least, most
 
     def _count(self) -> int:
