@@ -185,6 +185,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """Renders the whole image, or one batch of a checkpointed render."""
         return rendering.render(self, request)
 
+    @property
+    def has_expressions(self) -> bool:
+        """Whether its channels are those of light path expressions."""
+        return False
+
     def look_at(self, scene: mi.Scene) -> None:
         """Makes what the channels of :meth:`aov_names` need to know of a scene. A render calls it
         first."""

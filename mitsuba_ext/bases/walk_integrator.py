@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +25,18 @@ from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
-from ..scene.aovs import Aovs
-from ..scene.light_groups import light_groups
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
-from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.observer import Observer
-from ..transport.path_channels import PathChannels, colour_names
+from ..transport.path_channels import PathChannels
 from ..transport.path_decisions import SceneQuery
-from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
 from ..util.errors import InputError
 from ..util.stored_arrays import StoredArrays
+from .output_variables import OutputVariables
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 
@@ -93,7 +89,7 @@ class WalkIntegrator(StagedIntegrator):
             ends a sentence in an error message.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
-        channels (PathChannels): The light path expressions of the render; ``None`` without any.
+        outputs (OutputVariables): The channels of the parameter ``aovs``.
     """
 
     has_light_paths = light_paths_see_media = can_clamp = False
@@ -108,17 +104,7 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.clamps = self._read_clamps(props, read)
         self.aovs = read("aovs", "")
-        self._list = Aovs.read(self.name, self.aovs)
-        self._aovs: mi.Integrator | None = None
-        if by_mitsuba := self._list.by_mitsuba:
-            self._aovs = mi.load_dict({"type": "aov", "aovs": by_mitsuba})
-        if self.no_expressions and self.has_expressions:
-            raise NotImplementedError(
-                f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
-                f"render, because {self.no_expressions}"
-            )
-        self._groups: list[str] | None = None
-        self.channels: PathChannels | None = None
+        self.outputs = self._read_outputs()
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -375,39 +361,28 @@ class WalkIntegrator(StagedIntegrator):
         return sample.L, sample.valid, sample.aovs + self.sample_aovs(scene, sampler, ray)
 
     @property
+    def channels(self) -> PathChannels | None:
+        """The light path expressions of the render; ``None`` without any."""
+        return self.outputs.channels
+
+    @property
     def has_expressions(self) -> bool:
-        """Whether ``aovs`` has light path expressions, passes or light groups."""
-        return bool(self._list.expressions or self._list.groups)
+        return self.outputs.has_expressions
 
     def look_at(self, scene):
-        if not self.has_expressions:
-            return
-        self._groups = light_groups(scene)
-        expressions = self._list.of_groups(self._groups)
-        try:
-            self.channels = PathChannels(scene, list(expressions.values()))
-        except ValueError as error:
-            raise ValueError(f'"{self.name}": the parameter "aovs": {error}') from None
+        self.outputs.look_at(scene)
 
     def aov_names(self) -> list[str]:
-        names = self._list.of_groups(self._known_groups()).keys()
-        channels = [f"{name}.{colour}" for name in names for colour in colour_names()]
-        return channels + (self._aovs.aov_names() if self._aovs else [])
+        return self.outputs.names()
 
     @property
     def has_ray_aovs(self) -> bool:
-        names = self._list.of_groups(self._known_groups())
-        of_expressions = len(names) * len(colour_names())
-        return len(self.aov_names()) > of_expressions
+        return len(self.aov_names()) > len(self.outputs.expression_names())
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names, without the channels of light
         path expressions."""
-        if self._aovs is None:
-            return []
-        if has_unseen_shapes(scene):
-            return output_variables(self._aovs, self._list.by_mitsuba, scene, sampler, ray)
-        return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
+        return self.outputs.ray_values(scene, sampler, ray)
 
     def common_parameters(self) -> dict[str, Any]:
         return {
@@ -420,6 +395,22 @@ class WalkIntegrator(StagedIntegrator):
         }
 
     # ---- Helpers ----
+
+    def _read_outputs(self) -> OutputVariables:
+        outputs = OutputVariables(self.name, self.aovs)
+        if outputs.has_expressions and self.no_expressions:
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
+                f"render, because {self.no_expressions}"
+            )
+        for key, value in self.clamps.items():
+            if outputs.has_expressions and value > 0:
+                raise ValueError(
+                    f'"{self.name}": the parameter "{key}" is {value:g}, but "aovs" has light path '
+                    f"expressions, whose light is not clamped and would not add up to the image: "
+                    f"leave one of them out"
+                )
+        return outputs
 
     def _read_clamps(self, props: mi.Properties, read: ParameterReader) -> dict[str, float]:
         if self.can_clamp:
@@ -458,15 +449,3 @@ class WalkIntegrator(StagedIntegrator):
                 refuse_media(scene, what, f'choose another one, such as "{default}"')
         refuse_moving_grids(scene, f'"{self.name}"')
         refuse_missing_colours(scene, f'"{self.name}"')
-
-    def _known_groups(self) -> list[str]:
-        """The light groups of the scene, if the channels need them."""
-        if not self._list.groups:
-            return []
-        if self._groups is None:
-            raise ValueError(
-                f'"{self.name}": "{self._list.groups[0]}:light_groups" in "aovs" has a channel for '
-                f"each group of a scene, which is not known here: write a channel for each group "
-                f"instead, such as \"key:C.*<L.'key'>\""
-            )
-        return self._groups

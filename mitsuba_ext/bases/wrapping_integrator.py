@@ -106,6 +106,10 @@ class WrappingIntegrator(StagedIntegrator):
         self.check_sampled()
         return self.nested.sample(scene, sampler, ray, medium, active)
 
+    @property
+    def has_expressions(self) -> bool:
+        return self._is_staged and self.nested.has_expressions
+
     def look_at(self, scene):
         if self._is_staged:
             self.nested.look_at(scene)
@@ -115,7 +119,7 @@ class WrappingIntegrator(StagedIntegrator):
 
     @property
     def has_ray_aovs(self) -> bool:
-        return super().has_ray_aovs and (not self._is_staged or self.nested.has_ray_aovs)
+        return self._is_staged and self.nested.has_ray_aovs
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []

@@ -112,6 +112,7 @@ class Job:
                 f'channels ("aovs", "count_samples"): use an "hdrfilm".'
             )
         self.film.prepare(aovs)
+        self._has_ray_aovs = integrator.has_ray_aovs
         # A single part has no range, so that kernels need not add its first pixel
         self.parts = [None] if self.plan.parts == 1 else self.plan.pixels
         # Structured samplers, one for each part of the film, which keep their state between passes
@@ -316,7 +317,7 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if not self.freezes_passes or self.integrator.has_ray_aovs:
+        if not self.freezes_passes or self._has_ray_aovs:
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False
@@ -355,7 +356,9 @@ class Job:
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
             raise GradientsError
-        aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
+        aovs = sample.aovs
+        if self._has_ray_aovs:
+            aovs = aovs + self.integrator.sample_aovs(self.scene, sampler, rays.ray)
         camera.put(self.film, self.block, rays, sample, aovs, count)
         count_rays(self.tally, sample)
         return sample
