@@ -108,13 +108,13 @@ class Walk:
         """The samples, not clamped, and the direct light in each of them (``None`` where nothing
         :attr:`clamps`)."""
         with garbage_left_alone():
-            sample = self._trace(scene, sampler, rays, active)
+            sample, direct = self._trace(scene, sampler, rays, active)
         if self.channels is not None:
             # The sums of the channels are complete when the kernel of the samples has run
             schedule_state(sampler)
             dr.eval(sample, rays.position, rays.importance, rays.weight, rays.ray.wavelengths)
             sample.aovs = self.channels.values(rays)
-        return sample
+        return sample, direct
 
     def clamped(self, sample: Sample, direct: mi.Spectrum | None) -> Sample:
         """``sample``, clamped. ``direct`` is its direct light."""
