@@ -146,6 +146,10 @@ class AdaptiveSampling(WrappingIntegrator):
     def aov_names(self) -> list[str]:
         return [*self.nested.aov_names(), *([_COUNTS] if self.counts_samples else [])]
 
+    @property
+    def has_ray_aovs(self) -> bool:
+        return self.counts_samples or super().has_ray_aovs
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The AOVs of the nested integrator. The sample count is 0 here: it is known after the
         render only."""

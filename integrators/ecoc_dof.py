@@ -147,6 +147,12 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         if self.denoise:
             denoiser()
         self.refuse_equal_samples("the layers of {nested} cannot be rendered one by one")
+        if self._is_staged and self.nested.has_expressions:
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "aovs" of "{self.nested.name}" has light path '
+                f"expressions, but output variables are not blurred as the image is: use a "
+                f'"thinlens" and "{self.nested.name}" alone'
+            )
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
         return not self.is_of_this_kind(nested)

@@ -182,6 +182,9 @@ class InstantRadiosityIntegrator(WalkIntegrator):
             'max_depth': 8
     """
 
+    no_expressions = (
+        'the bound divides the light of a path between virtual lights and longer paths; use "bdpt"'
+    )
     has_light_paths = True
 
     def __init__(self, props: mi.Properties) -> None:

@@ -145,6 +145,9 @@ class IrradianceCache(WalkIntegrator):
             'cache_file': 'flight.npz'
     """
 
+    no_expressions = (
+        'its records hold light of all kinds together; use "composed_path" or "auto"'
+    )
     sees_media = False
 
     def __init__(self, props: mi.Properties) -> None:

@@ -141,9 +141,14 @@ class LightTracerIntegrator(WalkIntegrator):
             refuse_clear_curves(scene, f'"{self.name}"')
             self._warn_of_hidden(scene)
             emission = light_emission(self.name, scene)
-            walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+            walk = LightWalk(
+                emission, self.max_depth, self.rr_depth, query=query, channels=self.channels
+            )
             target = connectable_sensor(self.name, self.lens_sampling, scene, sensor, query)
-        directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)
+        directly = Walk(
+            min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query,
+            channels=self.channels,
+        )  # fmt: skip
         return OneStage(LightTracer(directly, walk, target))
 
     def _warn_of_hidden(self, scene: mi.Scene) -> None:

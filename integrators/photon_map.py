@@ -116,6 +116,9 @@ class PhotonMapping(WalkIntegrator):
             'photons': 1000000
     """
 
+    no_expressions = (
+        'its photons are gathered once for light of all kinds; use "sppm" or "vcm"'
+    )
     has_light_paths = True
 
     def __init__(self, props: mi.Properties) -> None:

@@ -86,6 +86,10 @@ class ChainIntegrator(WalkIntegrator):
 
     missing_in_samples = "its chains find the rest"
 
+    no_expressions = (
+        "a Markov chain only knows the brightness of its whole path; use "
+        '"composed_path", "bdpt" or "vcm"'
+    )
     sees_media = False
 
     #: False, as the weights in the film count its camera samples, and not its mutations.

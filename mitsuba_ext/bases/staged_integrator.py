@@ -170,6 +170,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         :class:`~mitsuba_ext.rendering.request.Request`, such as a ``timeout`` in the place of the
         parameter of that name."""
         spp = self._checked(scene, spp) or self.default_spp
+        self.look_at(scene)
         sensor = camera.find_sensor(scene, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         own = {"timeout": self.timeout, "progress": self.progress, "watch": self.watch}
@@ -192,12 +193,23 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """Renders the whole image, or one batch of a checkpointed render."""
         return rendering.render(self, request)
 
+    @property
+    def has_expressions(self) -> bool:
+        """Whether its channels are those of light path expressions."""
+        return False
+
+    def look_at(self, scene: mi.Scene) -> None:
+        """Makes what the channels of :meth:`aov_names` need to know of a scene. A render calls it
+        first."""
+
+    @property
+    def has_ray_aovs(self) -> bool:
+        """Whether :meth:`sample_aovs` returns any channels."""
+        return bool(self.aov_names())
+
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         """The values of the channels that :meth:`aov_names` names; none by default."""
         return []
-
-    def prepare_aovs(self, scene: mi.Scene) -> None:
-        """Prepares :meth:`sample_aovs` for a scene."""
 
     def mask_names(self) -> list[str]:
         """The channels of the masks. They follow the channels of :meth:`aov_names` in the image

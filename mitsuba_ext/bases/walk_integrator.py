@@ -25,20 +25,18 @@ from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
-from ..scene.aovs import AOV_TYPES, MASK_TYPES, check_aovs, split_aovs
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
-from ..scene.surface_names import SurfaceNames, surface_names
-from ..scene.unseen import has_unseen_shapes
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.observer import Observer
+from ..transport.path_channels import PathChannels
 from ..transport.path_decisions import SceneQuery
-from ..transport.queries.aovs import output_variables
 from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
 from ..util.errors import InputError
 from ..util.stored_arrays import StoredArrays
+from .output_variables import OutputVariables
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 
@@ -74,7 +72,10 @@ class WalkIntegrator(StagedIntegrator):
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`, and masks: the types :monosp:`object_id`,
+         :monosp:`depth:depth,nn:sh_normal`. Besides Mitsuba's types, there are named passes
+         (:monosp:`direct`, :monosp:`caustics`, …), light path expressions
+         (:monosp:`key:C.*<L.'key'>`), a channel for each light group
+         (:monosp:`groups:light_groups`), and masks: the types :monosp:`object_id`,
          :monosp:`material_id`, :monosp:`cryptomatte_object` and :monosp:`cryptomatte_material`.
          (Default: none)
 
@@ -86,12 +87,16 @@ class WalkIntegrator(StagedIntegrator):
         can_clamp (bool): Whether it has the parameters ``clamp_direct`` and ``clamp_indirect``.
         sees_media (bool): Whether it renders participating media. If not, it refuses them.
         light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
+        no_expressions (str): Why it cannot render light path expressions; empty if it can. The text
+            ends a sentence in an error message.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
+        outputs (OutputVariables): The channels of the parameter ``aovs``.
     """
 
     has_light_paths = light_paths_see_media = can_clamp = False
     sees_media = True
+    no_expressions = ""
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -101,15 +106,7 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.clamps = self._read_clamps(props, read)
         self.aovs = read("aovs", "")
-        check_aovs(self.name, self.aovs, (*AOV_TYPES, *MASK_TYPES))
-        items = split_aovs(self.aovs)
-        self.masks = tuple(item for item in items if item[1] in MASK_TYPES)
-        self._variables = ",".join(":".join(item) for item in items if item not in self.masks)
-        self._numbers_shapes = any(kind == "shape_index" for _name, kind in items)
-        self._names: SurfaceNames | None = None
-        self._aovs = None
-        if self._variables:
-            self._aovs = mi.load_dict({"type": "aov", "aovs": self._variables})
+        self.outputs = self._read_outputs()
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -142,6 +139,11 @@ class WalkIntegrator(StagedIntegrator):
                     f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
                     f"integrators without light paths"
                 )
+        if self.has_expressions and (caustics := self.slots.get("caustics")):
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "caustics" is "{caustics.name}", whose light is not '
+                f'divided among the light path expressions in "aovs": leave one of them out'
+            )
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             read = self.reader(props)
@@ -225,7 +227,7 @@ class WalkIntegrator(StagedIntegrator):
         weight = stage_weights((1, spp - 1))[0] if doubles else 1.0
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(request.scene),
-            **self.clamps,
+            **self.clamps, channels=self.channels,
         )  # fmt: skip
         return Stage(walk, weight=weight)
 
@@ -331,7 +333,7 @@ class WalkIntegrator(StagedIntegrator):
         observed = {} if observer is None else {"observer": observer}
         return Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, **decisions.of_walk(), **observed,
-            **self.clamps,
+            **self.clamps, channels=self.channels,
         )  # fmt: skip
 
     # ---- What Mitsuba calls ----
@@ -363,29 +365,41 @@ class WalkIntegrator(StagedIntegrator):
                 f"are made from all samples of a pixel: render with this integrator itself, and "
                 f"not in one that asks for single samples"
             )
-        self.prepare_aovs(scene)
         setting = Setting(
             scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
         )
+        self.look_at(scene)
         walk = self.walk(decisions_of(self.slots, setting, Decisions(query=self.query(scene))))
         sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
-        return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
+        return sample.L, sample.valid, sample.aovs + self.sample_aovs(scene, sampler, ray)
+
+    @property
+    def channels(self) -> PathChannels | None:
+        """The light path expressions of the render; ``None`` without any."""
+        return self.outputs.channels
+
+    @property
+    def masks(self) -> tuple[tuple[str, str], ...]:
+        return self.outputs.masks
+
+    @property
+    def has_expressions(self) -> bool:
+        return self.outputs.has_expressions
+
+    def look_at(self, scene):
+        self.outputs.look_at(scene)
 
     def aov_names(self) -> list[str]:
-        return self._aovs.aov_names() if self._aovs else []
+        return self.outputs.names()
 
-    def prepare_aovs(self, scene: mi.Scene) -> None:
-        self._names = surface_names(scene) if self._numbers_shapes else None
+    @property
+    def has_ray_aovs(self) -> bool:
+        return len(self.aov_names()) > len(self.outputs.expression_names())
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
-        """The values of the channels that :meth:`aov_names` names."""
-        if self._aovs is None:
-            return []
-        if has_unseen_shapes(scene) or self._numbers_shapes:
-            return output_variables(
-                self._aovs, self._variables, scene, sampler, ray, self._names
-            )
-        return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
+        """The values of the channels that :meth:`aov_names` names, without the channels of light
+        path expressions."""
+        return self.outputs.ray_values(scene, sampler, ray)
 
     def common_parameters(self) -> dict[str, Any]:
         return {
@@ -398,6 +412,22 @@ class WalkIntegrator(StagedIntegrator):
         }
 
     # ---- Helpers ----
+
+    def _read_outputs(self) -> OutputVariables:
+        outputs = OutputVariables(self.name, self.aovs)
+        if outputs.has_expressions and self.no_expressions:
+            raise NotImplementedError(
+                f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
+                f"render, because {self.no_expressions}"
+            )
+        for key, value in self.clamps.items():
+            if outputs.has_expressions and value > 0:
+                raise ValueError(
+                    f'"{self.name}": the parameter "{key}" is {value:g}, but "aovs" has light path '
+                    f"expressions, whose light is not clamped and would not add up to the image: "
+                    f"leave one of them out"
+                )
+        return outputs
 
     def _read_clamps(self, props: mi.Properties, read: ParameterReader) -> dict[str, float]:
         if self.can_clamp:

@@ -106,6 +106,14 @@ class WrappingIntegrator(StagedIntegrator):
         self.check_sampled()
         return self.nested.sample(scene, sampler, ray, medium, active)
 
+    @property
+    def has_expressions(self) -> bool:
+        return self._is_staged and self.nested.has_expressions
+
+    def look_at(self, scene):
+        if self._is_staged:
+            self.nested.look_at(scene)
+
     def aov_names(self) -> list[str]:
         return self.nested.aov_names()
 
@@ -113,9 +121,9 @@ class WrappingIntegrator(StagedIntegrator):
     def masks(self) -> tuple[tuple[str, str], ...]:
         return self.nested.masks if self._is_staged else ()
 
-    def prepare_aovs(self, scene: mi.Scene) -> None:
-        if self._is_staged:
-            self.nested.prepare_aovs(scene)
+    @property
+    def has_ray_aovs(self) -> bool:
+        return self._is_staged and self.nested.has_ray_aovs
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []

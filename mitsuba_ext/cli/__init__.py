@@ -26,6 +26,7 @@ from .diff import diff
 from .export_blender import export_blender
 from .merge import merge
 from .plugins import list_plugins
+from .relight import relight
 from .render import render
 from .replay import replay
 from .supervisor import SUPERVISED
@@ -52,8 +53,8 @@ def doctor() -> int:
 
 
 for command in (
-    render, view, merge, denoise, compare, diff, replay, list_plugins, doctor, export_blender,
-    completion,
+    render, view, merge, denoise, relight, compare, diff, replay, list_plugins, doctor,
+    export_blender, completion,
 ):  # fmt: skip
     cli.add_command(command)
 

@@ -19,6 +19,7 @@ from ..long_renders.folder import CheckpointFolder
 from ..rendering.scene_guides import render_guides
 from ..startup import machine
 from ..util import marks
+from ..util.errors import InputError
 from . import statistics
 from .common import kernels_compiled, say
 from .frame_parameters import FrameParameters
@@ -165,6 +166,7 @@ def render_image(
                 job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled
             masks = channel_names(getattr(job.integrator, "masks", ()))
+            _look_at(job)
             for file in filter(None, (output, order.preview)):
                 image_files.check_film(file, job.film, [*job.integrator.aov_names(), *masks])
             if masks and output.suffix.lower() != ".exr":
@@ -266,3 +268,16 @@ def _facts(order: Order, picture: Picture, job: RenderJob | LongJob) -> dict[str
         **({"Sensor": str(picture.sensor)} if picture.sensor is not None else {}),
         "Variant": order.variant,
     }
+
+
+def _look_at(job: LongJob | RenderJob) -> None:
+    """Tells the integrator the scene, on which the names of its channels depend.
+
+    Raises:
+        InputError: The channels that it should render are not possible in this scene.
+    """
+    if hasattr(job.integrator, "look_at"):
+        try:
+            job.integrator.look_at(job.chosen.scene)
+        except ValueError as error:
+            raise InputError(f"{job.chosen.loaded.source}: {error}") from error

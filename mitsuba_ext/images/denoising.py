@@ -112,10 +112,7 @@ def denoise_file(
     channels = {}
     if source.suffix.lower() == ".exr":
         channels, _ = image_files.read_exr(source)
-    guides = {name: _layer(channels, name) for name in _GUIDES}
-    guides = {name: guide for name, guide in guides.items() if guide is not None}
-    if "albedo" not in guides:
-        guides = {}
+    guides = guides_of(channels)
     is_linear = source.suffix.lower() in (".exr", ".hdr", ".pfm", ".npy", ".npz")
     result = denoise(pixels, **guides, is_linear=is_linear)
     if not np.isfinite(result).all():
@@ -127,6 +124,14 @@ def denoise_file(
     for target in targets:
         image_files.write_rgb(target, result, about)
     return list(guides)
+
+
+def guides_of(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The guides among the channels of an EXR, as arguments of :func:`denoise`."""
+    guides = {name: _layer(channels, name) for name in _GUIDES}
+    guides = {name: guide for name, guide in guides.items() if guide is not None}
+    # Open Image Denoise accepts normals only with an albedo
+    return guides if "albedo" in guides else {}
 
 
 def _without_noise(

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..scene.aovs import check_nodes, has_masks
+from ..scene.light_groups import group_nodes
 from ..util.errors import InputError, did_you_mean, one_line
 from ..util.files import is_utf8, printable
 from .content_hash import hash_each, hash_files
@@ -184,6 +185,7 @@ def load_scene(
             else:
                 state = mi.parser.parse_file(config, str(path), **strings)
             check_nodes(state)
+            group_nodes(state)
             check_parsed(state)
             if moved:
                 for (node, key), name in list(named_in(state)):

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
+from ..transport.path_channels import film_colours
 from ..util.spectra import to_rgb
 
 
@@ -322,9 +323,12 @@ def check_takes_splats(film: mi.Film) -> None:
 def put_splats(film: mi.Film, block: mi.ImageBlock, splats: Splats) -> None:
     """Puts splats into a block of their own, without weights (``filter_weights.py``)."""
     check_takes_splats(film)
-    rgb = to_rgb(splats.value, splats.wavelengths)
-    others = [mi.Float(0)] * (block.channel_count() - 3)
-    block.put(splats.position, [rgb.x, rgb.y, rgb.z, *others], splats.active)
+    values = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
+    values.append(mi.Float(0))
+    for part in splats.channels:
+        values += film_colours(part, splats.wavelengths)
+    values += [mi.Float(0)] * (block.channel_count() - len(values))
+    block.put(splats.position, values, splats.active)
 
 
 def _channels(

@@ -116,7 +116,7 @@ class Job:
                 f'channels ("aovs", "count_samples"): use an "hdrfilm".'
             )
         self.film.prepare(aovs)
-        integrator.prepare_aovs(self.scene)
+        self._has_ray_aovs = integrator.has_ray_aovs
         self.masks = None
         if integrator.masks:
             self.masks = MaskSamples(
@@ -328,7 +328,7 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if not self.freezes_passes or self.integrator.aov_names() or self.masks is not None:
+        if not self.freezes_passes or self._has_ray_aovs or self.masks is not None:
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False
@@ -377,7 +377,9 @@ class Job:
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
             raise GradientsError
-        aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
+        aovs = sample.aovs
+        if self._has_ray_aovs:
+            aovs = aovs + self.integrator.sample_aovs(self.scene, sampler, rays.ray)
         camera.put(self.film, self.block, rays, sample, aovs, count)
         count_rays(self.tally, sample)
         return sample

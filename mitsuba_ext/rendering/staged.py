@@ -68,8 +68,9 @@ class Staged(Protocol):
     def aov_names(self) -> list[str]:
         """Channels of the film besides colour and alpha."""
 
-    def prepare_aovs(self, scene: mi.Scene) -> None:
-        """Prepares :meth:`sample_aovs` for a scene."""
+    @property
+    def has_ray_aovs(self) -> bool:
+        """Whether :meth:`sample_aovs` has any."""
 
     def sample_aovs(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f

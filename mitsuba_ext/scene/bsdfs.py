@@ -16,16 +16,15 @@ from .movers import all_shapes
 #: BSDFs that perturb normals, as they appear in ``str(bsdf)``.
 _BUMPED = ("BumpMap[", "NormalMap[")
 
+#: Mitsuba's BSDFs that ignore the ``type_mask`` of a context when they are evaluated.
+_UNDIVIDED = ("Principled", "PrincipledThin")
+
 
 def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     """Which BSDFs of ``scene`` are, or contain, one of the ``classes``: a table over Dr.Jit's
     indices of BSDFs. ``None`` if no BSDF does. The BSDFs of an instance are not accessible: if the
     scene has an instance, all BSDFs in memory are examined."""
-    shapes = all_shapes(scene.shapes())
-    bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
-    if has_instances(scene):
-        bsdfs += _all_in_memory(mi.BSDFPtr)
-    found = [_index(bsdf) for bsdf in set(bsdfs) if contains_bsdf(bsdf, classes)]
+    found = [_index(bsdf) for bsdf in _bsdfs(scene) if contains_bsdf(bsdf, classes)]
     if not found:
         return None
     table = np.zeros(max(found) + 1, bool)
@@ -55,6 +54,35 @@ def opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
     return from_numpy(mi.Bool, table)
 
 
+def mixes_lobes(scene: mi.Scene) -> bool:
+    """Whether a BSDF of the scene has both diffuse and glossy lobes."""
+    diffuse, glossy = int(mi.BSDFFlags.Diffuse), int(mi.BSDFFlags.Glossy)
+    flags = [int(bsdf.flags()) for bsdf in _bsdfs(scene)]
+    return any(f & diffuse and f & glossy for f in flags)
+
+
+def undivided_bsdfs(scene: mi.Scene) -> mi.Float | None:
+    """For BSDFs that are, or contain, a ``principled`` or ``principledthin``: the weight of its
+    diffuse lobes (the mean over a texture). It is a table over Dr.Jit's indices of BSDFs, negative
+    for other BSDFs; ``None`` if there are only others."""
+    weights = {_index(b): _diffuse_weight(b) for b in _bsdfs(scene) if contains_bsdf(b, _UNDIVIDED)}
+    if not weights:
+        return None
+    table = np.full(max(weights) + 1, -1.0)
+    table[list(weights)] = list(weights.values())
+    return from_numpy(mi.Float, table)
+
+
+def _diffuse_weight(bsdf: mi.BSDF) -> float:
+    """(1 − metallic) (1 − spec_trans), by the names of the parameters."""
+    weight, parameters = 1.0, mi.traverse(bsdf)
+    for key in parameters.keys():
+        if {"metallic", "spec_trans"} & set(key.split(".")):
+            values = np.array(parameters[key], float)
+            weight *= 1 - float(values.mean()) if values.size else 1
+    return weight
+
+
 def has_clear_curves(scene: mi.Scene) -> bool:
     """Whether light passes through a curve, such as one with the BSDF ``hair``.
 
@@ -65,7 +93,7 @@ def has_clear_curves(scene: mi.Scene) -> bool:
     F = mi.BSDFFlags
     shapes = list(all_shapes(scene.shapes()))
     if has_instances(scene):
-        shapes += _all_in_memory(mi.ShapePtr)
+        shapes += all_in_memory(mi.ShapePtr)
     transmits = int(F.DiffuseTransmission) | int(F.GlossyTransmission) | int(F.DeltaTransmission)
     return any(
         shape.class_name() in ("BSplineCurve", "LinearCurve")
@@ -92,6 +120,13 @@ def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
         )
 
 
+def _bsdfs(scene: mi.Scene) -> set[mi.BSDF]:
+    """The BSDFs of a scene; with an instance, whose BSDFs are not accessible, all in memory."""
+    shapes = all_shapes(scene.shapes())
+    bsdfs = {shape.bsdf() for shape in shapes if shape.bsdf() is not None}
+    return bsdfs.union(all_in_memory(mi.BSDFPtr) if has_instances(scene) else ())
+
+
 def contains_bsdf(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
     """Whether ``bsdf`` is, or contains, one of the ``classes``."""
     if bsdf.class_name() in classes:
@@ -111,7 +146,7 @@ def contains_bsdf(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
     return nested.is_found
 
 
-def _all_in_memory(kind: type) -> Iterator[mi.Object]:
+def all_in_memory(kind: type) -> Iterator[mi.Object]:
     """The objects that arrays of pointers of this ``kind`` can refer to."""
     for index in itertools.count(1):
         try:

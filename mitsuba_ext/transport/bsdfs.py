@@ -73,6 +73,41 @@ def eval_and_sample_bsdf(
     return _finite_value(value), _finite(density), *_finite_sample(bs, weight)
 
 
+def diffuse_share(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    undivided: mi.Float | None,
+    active: mi.Bool | bool = True,
+) -> mi.UnpolarizedSpectrum:
+    """The share of diffuse lobes in the BSDF's value, without delta lobes, for each colour; 0 where
+    the value is zero. It depends on nothing but the vertex and the two directions.
+
+    Mitsuba's ``principled`` and ``principledthin`` do not evaluate their lobes separately. What is
+    diffuse is then what a Lambertian surface of the same albedo would scatter, but at most the
+    whole value.
+
+    Parameters:
+        undivided: The weight of the diffuse lobes where the BSDF is one of these two, or contains
+            one of them, elsewhere negative; ``None`` if it is negative everywhere.
+    """
+    parts = mi.BSDFContext(ctx.mode, ctx.type_mask, ctx.component)
+    diffuse = int(mi.BSDFFlags.Diffuse)
+    parts.type_mask = ctx.type_mask & ~(int(mi.BSDFFlags.All) & ~diffuse)
+    one = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, active)))
+    parts.type_mask = ctx.type_mask & ~diffuse
+    other = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, active)))
+    whole = one + other
+    if undivided is not None:
+        albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active))
+        lambertian = albedo * (undivided * dr.inv_pi * dr.abs(mi.Frame3f.cos_theta(wo)))
+        # Both evaluations above have returned the whole value
+        one = dr.select(undivided < 0, one, dr.minimum(lambertian, other))
+        whole = dr.select(undivided < 0, whole, other)
+    return dr.select(whole > 0, dr.clip(one / whole, 0, 1), 0)
+
+
 def _finite(number: mi.Float) -> mi.Float:
     return dr.select(dr.isfinite(number), number, 0)
 

@@ -11,6 +11,7 @@ import mitsuba as mi
 from .heroes import Heroes
 from .media import NoMedia
 from .observer import Observer
+from .path_channels import PathChannels
 from .path_decisions import (
     AlwaysTest,
     ConnectionCount,
@@ -65,8 +66,9 @@ class Connector:
         observer: Observer,
         media: NoMedia,
         replay: Replay | None = None,
+        channels: PathChannels | None = None,
     ) -> None:
-        self._media, self._replay = media, replay
+        self._media, self._replay, self._channels = media, replay, channels
         self._scene, self._query, self._heroes = scene, query, heroes
         self._weights, self._program = weights, program
         self._next_event, self._connections = next_event, connections
@@ -154,6 +156,8 @@ class Connector:
             visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
         if self._replay is not None:
             self._replay.connected(vertex, ds, β * (mis * weight), visible)
+        if self._channels is not None:
+            self._channels.connected(vertex, ds, value, visible)
         self._observer.connection(
             connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )

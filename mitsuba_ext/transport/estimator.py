@@ -49,6 +49,7 @@ class Splats:
         wavelengths: The wavelengths of ``value``, in spectral variants.
         active: Which lanes have something to add.
         sample: For Markov chains: the number of the camera ray to whose sample each splat belongs.
+        channels: The part of ``value`` that belongs to each light path expression.
     """
 
     value: mi.Spectrum
@@ -56,6 +57,7 @@ class Splats:
     wavelengths: mi.Spectrum | None
     active: mi.Bool
     sample: mi.UInt32 | None = None
+    channels: list[mi.Spectrum] = field(default_factory=list)
 
 
 @dataclass

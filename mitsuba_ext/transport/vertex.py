@@ -40,6 +40,8 @@ class PathState:
             nothing in the scene disperses light.
         history: What the program of the walk knows of the path so far
             (:class:`.path_program.PathProgram`); ``None`` if it needs nothing.
+        events: The state of the automaton that reads the path
+            (:class:`.path_channels.PathChannels`); ``None`` without light path expressions.
     """
 
     β: mi.Spectrum
@@ -49,6 +51,7 @@ class PathState:
     arrival: Arrival
     hero_is_alone: mi.Bool | None
     history: Any = None
+    events: Any = None
 
 
 @dataclass

@@ -23,7 +23,9 @@ from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes
 from .media import media_of
+from .numbers import schedule_state
 from .observer import Observer
+from .path_channels import PathChannels
 from .path_decisions import (
     AlwaysTest,
     ConnectionCount,
@@ -67,6 +69,8 @@ class Walk:
         clamp_direct, clamp_indirect: The largest mean over the channels of the light that a path
             of one or two segments, or all longer ones together, may add to a sample: brighter
             light is scaled to it. 0 for any. (Observers learn of light as it was before.)
+        channels: Adds the light to the channels of light path expressions; ``None`` if there are
+            none.
     """
 
     max_depth: int
@@ -86,6 +90,7 @@ class Walk:
     replay: Replay | None = None
     clamp_direct: float = 0.0
     clamp_indirect: float = 0.0
+    channels: PathChannels | None = None
 
     #: See :class:`~mitsuba_ext.transport.estimator.Estimator`.
     can_be_frozen = True
@@ -103,7 +108,13 @@ class Walk:
         """The samples, not clamped, and the direct light in each of them (``None`` where nothing
         :attr:`clamps`)."""
         with garbage_left_alone():
-            return self._trace(scene, sampler, rays, active)
+            sample, direct = self._trace(scene, sampler, rays, active)
+        if self.channels is not None:
+            # The sums of the channels are complete when the kernel of the samples has run
+            schedule_state(sampler)
+            dr.eval(sample, rays.position, rays.importance, rays.weight, rays.ray.wavelengths)
+            sample.aovs = self.channels.values(rays)
+        return sample, direct
 
     def clamped(self, sample: Sample, direct: mi.Spectrum | None) -> Sample:
         """``sample``, clamped. ``direct`` is its direct light."""
@@ -126,6 +137,7 @@ class Walk:
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
             self.query, heroes, self.mis, self.program, self.observer, media, self.replay,
+            self.channels,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
         # In media, transmittance uses random numbers; `volpath` draws them before the BSDF's
@@ -145,6 +157,7 @@ class Walk:
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
             history=self.program.begin(ray),
+            events=None if self.channels is None else self.channels.begin(rays),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Whether it has met anything
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -183,6 +196,8 @@ class Walk:
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
+                if dr.hint(self.channels is not None, mode="scalar"):
+                    self.channels.emitted(path, hit.emitter, path.β * emitted, active)
                 if dr.hint(self.replay is not None, mode="scalar"):
                     seen = active & (path.arrival.pdf > 0)
                     if dr.hint(self.hide_emitters, mode="scalar"):
@@ -269,6 +284,7 @@ class Walk:
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
                 history=history,
+                events=None if self.channels is None else self.channels.left(vertex, bs),
             )
             path = media.leave(vertex, bs, onward)
             active_next = media.is_within(path.depth, self.max_depth, active_next)

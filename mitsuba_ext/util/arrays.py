@@ -104,6 +104,8 @@ def _of_columns(part: Any, columns: Iterator[Any]) -> Any:
     if part is None:
         return None
     kind = type(part)
+    if kind is list:
+        return [_of_columns(x, columns) for x in part]
     if is_dataclass(kind):
         return kind(*(_of_columns(getattr(part, field.name), columns) for field in fields(kind)))
     if dr.depth_v(kind) > 1:

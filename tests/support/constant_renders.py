@@ -67,6 +67,8 @@ class FixedSchedule(Schedule):
 class TwoStages:
     """Two stages of constants: a pilot worth 1 and a rest worth 3."""
 
+    has_ray_aovs = False
+
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.is_cancelled, self.masks = False, ()
@@ -86,9 +88,6 @@ class TwoStages:
 
     def aov_names(self):
         return []
-
-    def prepare_aovs(self, scene):
-        pass
 
     def sample_aovs(self, scene, sampler, ray):
         return []

@@ -10,6 +10,7 @@ import mitsuba as mi
 from ...transport.bsdfs import bsdf_density, eval_bsdf
 from ...transport.heroes import Heroes
 from ...transport.observer import Observer
+from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import SceneQuery
 from ...transport.path_program import Subpaths
 from ...transport.vertex import Vertex
@@ -98,6 +99,7 @@ class LightSubpaths(Subpaths):
         max_depth: Longest path in segments.
         observer: Receives the connections to vertices that are chosen by regions.
         techniques: Receives the contributions of connections.
+        channels: Adds them to the channels of light path expressions; ``None`` without any.
     """
 
     def __init__(
@@ -111,7 +113,9 @@ class LightSubpaths(Subpaths):
         max_depth: int,
         observer: Observer,
         techniques: TechniqueObserver | None = None,
+        channels: PathChannels | None = None,
     ) -> None:
+        self._channels = channels
         self._vertices, self._choice, self._sums, self._query = vertices, choice, sums, query
         self._connections, self._observer, self._techniques = connections, observer, techniques
         self._heroes = Heroes(scene)
@@ -184,6 +188,9 @@ class LightSubpaths(Subpaths):
         ds.p, ds.n, ds.d, ds.dist = far.p, far.n, d, distance
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
+        if self._channels is not None:
+            others = self._channels.past(other, back, visible)
+            self._channels.joined(vertex, wo, others, value, visible)
         if self._techniques is not None:
             competing = None
             if self._sums.splits:

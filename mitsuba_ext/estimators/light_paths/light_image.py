@@ -9,6 +9,7 @@ from ...transport.estimator import CameraRays, Splats
 from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
 from ...transport.numbers import Numbers, hashed_2d
+from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import SceneQuery
 from .choice.technique_observer import TechniqueObserver
 from .light_vertices import VertexCache
@@ -38,6 +39,7 @@ class LightImage:
         least_depth: Least number of segments between the light and a vertex that is connected.
         observer: Receives the splats.
         light_paths: Number of light paths for each camera path.
+        channels: Divides the splats among light path expressions; ``None`` without any.
 
     Attributes:
         shadow_count: Number of shadow rays traced.
@@ -55,7 +57,9 @@ class LightImage:
         least_depth: int = 1,
         observer: TechniqueObserver | None = None,
         light_paths: float = 1.0,
+        channels: PathChannels | None = None,
     ) -> None:
+        self._channels = channels
         self._share = dr.opaque(mi.Float, 1 / light_paths)
         self._least_depth = least_depth
         self._observer = observer
@@ -76,6 +80,7 @@ class LightImage:
         return (
             self._least_depth, self._scene, self._sensor, self._importance, self._sums,
             self._query, self._hides_emitters, self._seed, self._share, self._observer,
+            self._channels,
         )  # fmt: skip
 
     def splats(self, vertices: VertexCache) -> Splats:
@@ -139,8 +144,13 @@ class LightImage:
             self._observer.splatted(
                 vertex.depth + 1, connection.position, value, mis, competing, finite
             )
+        channels: list[mi.Spectrum] = []
+        if self._channels is not None:
+            states = self._channels.past(vertex, to_camera, active)
+            channels = self._channels.splatted(states, value)
         return Splats(
-            value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane
-        ), tested
+            value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane,
+            channels,
+        ), tested  # fmt: skip
 
     _connect_frozen = frozen(_connect)

@@ -41,7 +41,7 @@ class LightTracer:
         walk = self.light_walk
         image = LightImage(
             scene, self.sensor, sampler, rays, query=walk.query,
-            hides_emitters=self.directly.hide_emitters,
+            hides_emitters=self.directly.hide_emitters, channels=walk.channels,
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read them again
         dr.schedule(sample, rays.ray.wavelengths)

@@ -33,16 +33,22 @@ class Layout:
         spectrum: Words of a spectrum.
         history: How the history of the path is stored.
         is_whole: Whether all fields of the interaction are stored.
+        events: Words of the state of light path expressions.
     """
 
     spectrum: int
     history: StoredHistory
     is_whole: bool
+    events: int = 0
 
     @property
     def words(self) -> int:
-        used = self.mark + 1 + interaction_words(self.is_whole)
-        return -(-used // _PACKET) * _PACKET
+        return -(-(self.state + self.events) // _PACKET) * _PACKET
+
+    @property
+    def state(self) -> int:
+        """Index of the first word of the state of expressions: it follows the interaction."""
+        return self.mark + 1 + interaction_words(self.is_whole)
 
     @property
     def mark(self) -> int:
@@ -85,6 +91,7 @@ class VertexStore:
         depth: mi.UInt32,
         hero_is_alone: mi.Bool | None,
         active: mi.Bool,
+        events: list[mi.UInt32] | None = None,
     ) -> None:
         """Writes a vertex."""
         mark = mi.UInt32(depth)
@@ -95,6 +102,7 @@ class VertexStore:
             mark |= history.region << _DEPTH_BITS
         words = [*β, *stored.words(history), as_float(mark)]
         words += to_words(si, self.layout.is_whole)
+        words += [as_float(state) for state in events or ()]
         words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), place, active)
 
@@ -131,6 +139,7 @@ class LightVertex:
         hero_is_alone: Whether only the first wavelength is left; ``None`` where nothing disperses
             light.
         lane: The number of the light path.
+        events: The state of light path expressions at the vertex; ``None`` without any.
     """
 
     si: mi.SurfaceInteraction3f
@@ -139,6 +148,7 @@ class LightVertex:
     depth: mi.UInt32
     hero_is_alone: mi.Bool | None
     lane: mi.UInt32
+    events: list[mi.UInt32] | None = None
 
 
 class VertexCache:
@@ -248,14 +258,16 @@ class VertexCache:
             depth, region = _depth_and_region(mark)
         history = layout.history.read([w[i] for i in range(n, layout.mark)], depth, region)
         lane = dr.gather(mi.UInt32, self._lane, index, active)
-        si = from_words([w[i] for i in range(layout.mark + 1, layout.words)], layout.is_whole)
+        si = from_words([w[i] for i in range(layout.mark + 1, layout.state)], layout.is_whole)
         si.t = dr.select(active, mi.Float(0), dr.inf)
         si.time = self._of_lane(self._time, lane, active)
         if mi.is_spectral:
             si.wavelengths = self._of_lane(self._wavelengths, lane, active)
         hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else None
         β = mi.Spectrum(*(w[i] for i in range(n)))
-        return LightVertex(si, β, history, depth, hero_is_alone, lane)
+        states = range(layout.state, layout.state + layout.events)
+        events = [dr.reinterpret_array(mi.UInt32, w[i]) for i in states] or None
+        return LightVertex(si, β, history, depth, hero_is_alone, lane, events)
 
     def position(self, index: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         """The positions of the vertices with these indices."""

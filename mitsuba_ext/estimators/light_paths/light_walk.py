@@ -17,6 +17,7 @@ from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
 from ...transport.media import NoMedia, media_of
 from ...transport.numbers import Numbers, copied, go_to, reached, schedule_state
+from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import Roulette, SceneQuery
 from ...transport.vertex import Arrival, PathState, Vertex
 from .emission import EmittedRay, LightEmission
@@ -51,6 +52,7 @@ class LightPaths:
         scatter_count: Rays traced in directions that were sampled from a BSDF.
         inside: The state between two vertices (``transport/media.py``); ``None`` without media.
         active: Paths that have not ended.
+        events: The state of light path expressions; ``None`` without any.
     """
 
     ray: mi.Ray3f
@@ -64,6 +66,7 @@ class LightPaths:
     scatter_count: mi.UInt32
     inside: Any
     active: mi.Bool
+    events: list[mi.UInt32] | None = None
 
 
 @dataclass
@@ -89,6 +92,7 @@ class LightWalk:
             this is ``None``, a smooth lobe. ``program`` treats other vertices as specular.
         outside: In scenes with media, the medium outside of all boundaries (:func:`outer_medium`);
             ``None`` if paths should pass through media as if through a vacuum.
+        channels: Reads the events of the paths for light path expressions; ``None`` without any.
     """
 
     emission: LightEmission
@@ -99,12 +103,14 @@ class LightWalk:
     query: SceneQuery = field(default_factory=SceneQuery)
     stored_lobes: int | None = None
     outside: mi.MediumPtr | None = None
+    channels: PathChannels | None = None
 
     @property
     def layout(self) -> Layout:
         """The layout of the stored vertices."""
         is_whole = self.emission.needs_whole_interaction
-        return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole)
+        events = 0 if self.channels is None else self.channels.colours
+        return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole, events)
 
     def run(
         self,
@@ -223,6 +229,8 @@ class LightWalk:
             dr.full(mi.Float, 1, width), history, dr.full(mi.UInt32, 1, width),
             Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
         )  # fmt: skip
+        if self.channels is not None:
+            paths.events = self.channels.begin_light(emitted.emitter)
         if paths.hero_is_alone is not None:
             paths.hero_is_alone = dr.zeros(mi.Bool, width)
         return paths
@@ -252,7 +260,7 @@ class LightWalk:
             is_stored = active & self._is_stored(media, vertex, stores)
             store.write(
                 place, si, paths.emitted * media.arriving(β, vertex), history, paths.depth,
-                paths.hero_is_alone, is_stored,
+                paths.hero_is_alone, is_stored, paths.events,
             )  # fmt: skip
             place += dr.select(is_stored, 1, 0)
 
@@ -264,6 +272,7 @@ class LightWalk:
                 heroes, vertex, bs, weight, history, stores, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            events = self.channels and self.channels.left_by_light(vertex, bs)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 
@@ -287,7 +296,7 @@ class LightWalk:
             active_next &= media.meets(pi, inside) & (scatter_count < _MOST_BOUNCES)
             paths = LightPaths(
                 ray, pi, paths.emitted, β, sampling_weight, history, depth, hero_is_alone,
-                scatter_count, inside, active_next,
+                scatter_count, inside, active_next, events,
             )  # fmt: skip
             active = active_next & (place < end)
         return numbers, paths, store.finish(place, paths.active)

@@ -118,11 +118,11 @@ class BidirectionalPathTracer:
             numbers = sampler if light.count == lanes else light.numbers
             image = LightImage(
                 scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
-                2 if self.skips_direct else 1, observer, per_camera_path,
+                2 if self.skips_direct else 1, observer, per_camera_path, walk.channels,
             )  # fmt: skip
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, LightSums(sums, walk.next_event),
-            query=walk.query,
+            query=walk.query, channels=walk.channels,
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
@@ -140,14 +140,14 @@ class BidirectionalPathTracer:
             if self.connections > 0:
                 subpaths = LightSubpaths(
                     scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
-                    walk.observer, observer,
+                    walk.observer, observer, walk.channels,
                 )  # fmt: skip
             if radius is not None:
                 kept = None if self.merges_all else vertices.is_caustic
                 grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
                 subpaths = MergedSubpaths(
                     vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
-                    observer,
+                    observer, walk.channels,
                 )  # fmt: skip
         program: PathProgram = BidirectionalProgram(
             scene, sums, self.emission, self.sensor, observer, subpaths

@@ -18,6 +18,7 @@ import numpy as np
 from ....scene.bounds import scene_bounds
 from ....transport.bsdfs import eval_bsdf
 from ....transport.heroes import Heroes
+from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import SceneQuery
 from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
@@ -199,6 +200,7 @@ class MergedSubpaths(Subpaths):
             wavelengths. ``grid`` then has these groups.
         others: Other techniques at the same vertices; ``None`` if there are none.
         observer: Receives what merging adds.
+        channels: Adds it to the channels of light path expressions; ``None`` without any.
     """
 
     def __init__(
@@ -212,7 +214,9 @@ class MergedSubpaths(Subpaths):
         shares_rays: bool = False,
         others: Subpaths | None = None,
         observer: TechniqueObserver | None = None,
+        channels: PathChannels | None = None,
     ) -> None:
+        self._channels = channels
         self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
         self._heroes, self._ctx, self._observer = heroes, heroes.context(), observer
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
@@ -284,6 +288,9 @@ class MergedSubpaths(Subpaths):
                 is_first = other.depth == 1, vertex.depth == 0
                 competing = self._sums.competing_with_merging(*ends, is_first)
         active &= dr.all(dr.isfinite(value))
+        if self._channels is not None:
+            brought = value * vertex.path.β * self._per_vertex
+            self._channels.joined(vertex, wo, other.events, brought, active)
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:

@@ -23,6 +23,7 @@ import mitsuba as mi
 from ....transport.free_flight import Distances, attenuation, component, extinction, interaction_at
 from ....transport.heroes import Heroes
 from ....transport.media import eval_phase
+from ....transport.path_channels import PathChannels
 from ....transport.path_program import Subpaths
 from ....transport.vertex import PathState, Vertex
 from ..choice.technique_observer import TechniqueObserver
@@ -67,7 +68,8 @@ class MergedInMedia(MergedSubpaths):
     """Adds to camera paths the light that light paths bring near them in participating media.
 
     Parameters:
-        vertices, grid, heroes, max_depth, paths, shares_rays: See :class:`MergedSubpaths`.
+        vertices, grid, heroes, max_depth, paths, shares_rays, channels: See
+            :class:`MergedSubpaths`.
         others: The light at surfaces.
         has_grids: Whether there may be media that are not homogeneous.
         observer: See :class:`MergedSubpaths`.
@@ -84,9 +86,10 @@ class MergedInMedia(MergedSubpaths):
         others: Subpaths,
         has_grids: bool,
         observer: TechniqueObserver | None = None,
+        channels: PathChannels | None = None,
     ) -> None:
         super().__init__(
-            vertices, grid, None, heroes, max_depth, paths, shares_rays, others, observer
+            vertices, grid, None, heroes, max_depth, paths, shares_rays, others, observer, channels
         )
         self._has_grids = has_grids
 
@@ -135,6 +138,8 @@ class MergedInMedia(MergedSubpaths):
                 other = self._vertices.at(near[0], exists)
                 value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
                 gathered += value
+                if dr.hint(self._channels is not None, mode="scalar"):
+                    self._channels.joined_in_medium(path, other.events, value * weight, exists)
                 if dr.hint(self._observer is not None, mode="scalar"):
                     carried = path.β * σ_s * other.β
                     self._observer.photon(value * weight, carried, other.history, exists)
@@ -153,6 +158,9 @@ class MergedInMedia(MergedSubpaths):
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
         value = self._flux(vertex.medium.mei, vertex.path, other, active)
+        if self._channels is not None:
+            brought = value * vertex.path.β * self._per_vertex
+            self._channels.joined_in_medium(vertex.path, other.events, brought, active)
         if self._observer is not None:
             σ_s, _, _ = vertex.medium.mei.medium.get_scattering_coefficients(
                 vertex.medium.mei, active

@@ -93,7 +93,8 @@ class PhotonMapper:
             self.observer.camera(rays)
         lanes = dr.width(rays.ray)
         light = LightPathRays.of(sampler, rays, self.light_paths)
-        vertices, scatter_count = self.light_walk.run(
+        light_walk = replace(self.light_walk, channels=self.walk.channels)
+        vertices, scatter_count = light_walk.run(
             scene, light.numbers, light.time, light.wavelengths, light.emits(active)
         )
         walk, merged = self.walk, None
@@ -120,13 +121,14 @@ class PhotonMapper:
         grid = VertexGrid(vertices, radius, kept, group)
         heroes, max_depth = Heroes(scene), self.walk.max_depth
         merged = MergedSubpaths(
-            vertices, grid, None, heroes, max_depth, paths, groups, None, self.observer
-        )
+            vertices, grid, None, heroes, max_depth, paths, groups, None, self.observer,
+            self.walk.channels,
+        )  # fmt: skip
         if self.ball is None:
             return merged
         radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
         grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
         return MergedInMedia(
             vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene),
-            self.observer,
+            self.observer, self.walk.channels,
         )  # fmt: skip

@@ -9,6 +9,7 @@ import mitsuba as mi
 from ....rendering.request import Request
 from ....scene.bsdfs import refuse_clear_curves
 from ....scene.media import may_have_media
+from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import NoConnections, SceneQuery
 from ....transport.walk import Walk
 from ..light_media import outer_medium
@@ -25,6 +26,7 @@ class PathIntegrator(Protocol):
     max_depth: int
     rr_depth: int
     hide_emitters: bool
+    channels: PathChannels | None
 
     def query(self, scene: mi.Scene) -> SceneQuery:
         """How rays are intersected with the scene."""
@@ -60,6 +62,6 @@ def photon_mapper(
         ball = merging.ball_of(scene, sensor, light_walk, before, radius_in_media)
     walk = Walk(
         integrator.max_depth, integrator.rr_depth, integrator.hide_emitters,
-        next_event=NoConnections(), query=query,
+        next_event=NoConnections(), query=query, channels=integrator.channels,
     )  # fmt: skip
     return PhotonMapper(walk, light_walk, radius, ball, light_paths)

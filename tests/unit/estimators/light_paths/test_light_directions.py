@@ -224,4 +224,4 @@ def test_freed_bsdfs_are_not_among_the_bsdfs_in_memory() -> None:
     kept = [mi.load_dict(diffuse(0.5)) for _ in range(20)]
     del kept[3:17]
     gc.collect()
-    assert all(isinstance(bsdf, mi.BSDF) for bsdf in bsdfs._all_in_memory(mi.BSDFPtr))
+    assert all(isinstance(bsdf, mi.BSDF) for bsdf in bsdfs.all_in_memory(mi.BSDFPtr))

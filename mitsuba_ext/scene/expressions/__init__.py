@@ -1,0 +1,1 @@
+"""Light path expressions: regular expressions over the events of a path."""
