@@ -93,8 +93,7 @@ def auto(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -143,8 +142,7 @@ def auto_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -204,8 +202,7 @@ def bdpt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -292,8 +289,7 @@ def composed_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -451,8 +447,7 @@ def erpt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -517,8 +512,7 @@ def instant_radiosity(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -571,8 +565,7 @@ def irradiance_cache(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -608,8 +601,7 @@ def light_tracer(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -670,8 +662,7 @@ def mlt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -741,8 +732,7 @@ def neepp(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -797,8 +787,7 @@ def photon_map(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -863,8 +852,7 @@ def pss_guided(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -922,8 +910,7 @@ def pssmlt(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -977,8 +964,7 @@ def reweighted_direct(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -1119,8 +1105,7 @@ def sppm(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -1194,8 +1179,7 @@ def swarm_path(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -1259,8 +1243,7 @@ def two_stage(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
@@ -1348,8 +1331,7 @@ def vcm(
             before. (Default: none)
         checkpoint_every (string): How often it is saved: 60s, 10m, 2h or 100spp. (Default: 60s)
         aovs (string): Arbitrary output variables, in the syntax of Mitsuba's aov integrator, such
-            as depth:depth,nn:sh_normal, and masks: the types object_id, material_id,
-            cryptomatte_object and cryptomatte_material. (Default: none)
+            as depth:depth,nn:sh_normal. (Default: none)
     """
 
 
