@@ -19,8 +19,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 #: The attributes that a render sets because users read them afterwards; and of ``composed_prb``,
 #: what it remembers for the next render.
 _RESULTS = {
-    "statistics", "learners", "techniques", "maps", "records", "rounds", "progress", "_remembered",
-    "_renders",
+    "statistics", "learners", "techniques", "maps", "records", "rounds", "progress", "coverage",
+    "_remembered", "_renders",
 }  # fmt: skip
 
 PATH = {"type": "composed_path", "max_depth": 3}

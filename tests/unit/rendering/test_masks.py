@@ -297,7 +297,7 @@ def test_merged_meshes_are_refused() -> None:
     ("make", "message"),
     [
         (lambda: mi.load_dict({"type": "neepp", "aovs": "a:object"}), 'not "a:object"'),
-        (lambda: _integrator("a:object_id,a:depth"), 'the name "a" twice'),
+        (lambda: _integrator("a:object_id,a:depth"), 'two items of "aovs" have the name "a"'),
         (
             lambda: mi.load_dict({"type": "variance", "nested": _integrator("a:object_id")}),
             "have no variance",

@@ -59,7 +59,10 @@ class _Cells:
     """Cells of which only the number matters."""
 
     def __init__(self, count: int) -> None:
-        self.count, self.emitter_index = count, np.zeros(count, dtype=np.uint32)
+        self.count = count
+
+    def first_cells(self):
+        return np.zeros(1, np.uint32)
 
     def sample(self, cell, si, x, active):
         return dr.zeros(mi.DirectionSample3f, dr.width(cell)), mi.Color3f(1)
