@@ -81,7 +81,7 @@ class Aovs:
         by_mitsuba, expressions, groups, masks = [], {}, [], []
         names: set[str] = set()
         for name, kind in split_aovs(aovs):
-            is_word = re.fullmatch(r"[a-z_]*", kind) is not None
+            is_word = re.fullmatch(r"[a-z_:]*", kind) is not None
             if not name or (is_word and kind not in (*AOV_TYPES, *_OWN_TYPES)):
                 raise ValueError(_message(plugin, name, kind, (*AOV_TYPES, *_OWN_TYPES)))
             if name in names:

@@ -54,11 +54,10 @@ def _without(technique: str, folder: Path) -> None:
     table.write_text("".join(line for line in lines if technique not in line), encoding="utf-8")
 
 
-@pytest.mark.parametrize("technique", [
-    "swarming", pytest.param("learned_lights", marks=pytest.mark.slow),
-    pytest.param("guided_directions", marks=pytest.mark.slow),
-    pytest.param("portal_lights", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "technique", ["swarming", "learned_lights", "guided_directions", "portal_lights"]
+)
 def test_everything_else_works_without_a_technique(tmp_path: Path, technique: str) -> None:
     _without(technique, tmp_path)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}

@@ -344,6 +344,7 @@ def troubled(make_scene, tmp_path):
         process.wait()
 
 
+@pytest.mark.slow
 def test_integrator_that_takes_the_process_down_is_a_failed_row(
     run, troubled, tmp_path, monkeypatch
 ):

@@ -104,6 +104,7 @@ def test_figures_and_the_curve_follow_the_render(page: Any, live: Live):
     until(page, "document.querySelector('.curve').points.length === 4")
 
 
+@pytest.mark.slow
 def test_exposure_and_pixels_are_those_of_the_linear_image(page: Any, live: Live):
     assert pixel(page) == [137, 137, 137, 255]  # 0.25 in sRGB
     page.locator("#exposure").fill("1")
@@ -125,6 +126,7 @@ def test_exposure_and_pixels_are_those_of_the_linear_image(page: Any, live: Live
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_noise_of_each_pixel_is_a_layer(page: Any):
     page.locator("[data-layer=error]").click()
     shows(page, "% of the brightness")
@@ -132,6 +134,7 @@ def test_the_noise_of_each_pixel_is_a_layer(page: Any):
     until(page, "canvas.getContext('2d').getImageData(3, 2, 1, 1).data[0] > 240")
 
 
+@pytest.mark.slow
 def test_several_images_have_names(page: Any, live: Live):
     live.show(8, np.zeros((10, 10, 3)), HOSTILE)
     until(page, "document.querySelector('#picture').options.length === 2")
@@ -155,6 +158,7 @@ def test_buttons_pause_and_stop_the_render(page: Any, live: Live, monkeypatch):
     assert page.locator("#stop").is_disabled()
 
 
+@pytest.mark.slow
 def test_without_the_key_the_page_has_no_buttons(page: Any, live: Live):
     page.goto("about:blank")
     page.goto(live.web.address.split("#")[0])
@@ -162,6 +166,7 @@ def test_without_the_key_the_page_has_no_buttons(page: Any, live: Live):
     assert page.locator("#actions").is_hidden()
 
 
+@pytest.mark.slow
 def test_the_last_image_stays_when_the_render_has_ended(page: Any, live: Live):
     live.show(64, np.full((20, 30, 3), 1.0))
     live.viewer.close(FINISHED)  # waits for the page
@@ -172,6 +177,7 @@ def test_the_last_image_stays_when_the_render_has_ended(page: Any, live: Live):
     assert page.locator("#lost").is_hidden()
 
 
+@pytest.mark.slow
 def test_a_page_whose_render_is_gone_says_so(browser: Any, live: Live):
     """A killed process says nothing."""
     live.show(4)
@@ -185,6 +191,7 @@ def test_a_page_whose_render_is_gone_says_so(browser: Any, live: Live):
     page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1400, 800, 360])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_its_width(page: Any, width: int, scheme: str):
@@ -195,6 +202,7 @@ def test_the_page_fits_its_width(page: Any, width: int, scheme: str):
     assert (background == "rgb(255, 255, 255)") == (scheme == "light")
 
 
+@pytest.mark.slow
 def test_controls_have_names(page: Any):
     for control in page.locator("button, select, input, progress, [tabindex]").all():
         named = control.evaluate(

@@ -66,6 +66,7 @@ def nothing_kept():
 
 
 @pytest.mark.usefixtures("nothing_kept")
+@pytest.mark.slow
 def test_only_later_renders_of_the_same_scene_use_the_kept_state() -> None:
     scene, keeping = _small("rooms"), {"max_depth": 6, "keep_learned": True}
     first = mi.load_dict({"type": "neepp", **keeping})

@@ -95,7 +95,9 @@ def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, rend
     assert _recorded() == (["_estimated"] if known else [])
 
 
-@pytest.mark.parametrize("name", ["auto_path", "bdpt", "pssmlt"])
+@pytest.mark.parametrize(
+    "name", ["auto_path", "bdpt", pytest.param("pssmlt", marks=pytest.mark.slow)]
+)
 def test_images_of_a_thin_lens_agree_with_traced_kernels(name: str) -> None:
     """Light paths and chains use the sensor, and are not recorded."""
     parameters = {"type": name, "max_depth": 4, **_CHAINS.get(name, {})}
