@@ -235,7 +235,7 @@ def test_wheel_has_plugins_and_templates_and_nothing_else(built: tuple[Path, Pat
         # The folders of plugins are inside of the installed package
         prefix = "" if folder == "mitsuba_ext" else "mitsuba_ext/"
         for file in (tree / folder).rglob("*"):
-            if file.suffix in (".py", ".html", ".css", ".js"):
+            if file.suffix in (".py", ".pyi", ".html", ".css", ".js"):
                 wanted.add(prefix + str(file.relative_to(tree)))
     assert "mitsuba_ext/compare/report/report.css" in wanted
     info = f"mitsuba_ext-{mitsuba_ext.__version__}.dist-info/"
