@@ -197,12 +197,14 @@ class SampleTrees:
 
 
 def _end_in_leaves(nodes: np.ndarray) -> bool:
-    """Whether all ways down packed nodes end in a leaf."""
+    """Whether all ways down packed nodes end in a leaf. Leaves have a slot, too: their values are
+    looked up there. (A tree without splits names the slots 0 to 3.)"""
     side = np.arange(4, dtype=np.uint32)
     is_leaf = (nodes[:, :1] >> (3 * _BITS + side)) & 1 == 1
-    child = np.where(is_leaf, 0, nodes[:, 1:].astype(np.int64) + side)
-    if not len(nodes) or child.max() >= len(nodes):
+    child = nodes[:, 1:].astype(np.int64) + side
+    if not len(nodes) or child.max() >= max(len(nodes), len(side)):
         return False
+    child = np.where(is_leaf, 0, child)
     ends = is_leaf.all(axis=1)
     for _level in range(_DEEPEST):
         if ends.all():

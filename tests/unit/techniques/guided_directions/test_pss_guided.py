@@ -232,7 +232,7 @@ def test_renders_in_between_change_nothing(parameters: dict[str, Any]) -> None:
     np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-5 * first.mean())
 
 
-@pytest.mark.parametrize("parameters, few", [({}, 1), (TILES, 8)], ids=["surfaces", "tiles"])
+@pytest.mark.parametrize("parameters, few", [({}, 1), (TILES, 16)], ids=["surfaces", "tiles"])
 def test_another_seed_compiles_little(parameters: dict[str, Any], few: int) -> None:
     """Other numbers of samples and of nodes share the kernels of the first renders; but a forest
     in which a single node is split has its own."""
