@@ -6,8 +6,8 @@
 The table has FLIP, and relMSE in brackets, the means over seeds: of the image, and of the image
 denoised by Open Image Denoise with no guides, with Mitsuba's ``eval_diffuse_reflectance`` (clipped)
 as the albedo, and with the albedo of ``render_guides``. The last column is the mean of the image,
-divided by the mean of the reference. Scenes of the papers have their references
-beside them (``max_depth`` 6); those of our scenes are rendered by ``auto`` first and kept in
+divided by the mean of the reference. Scenes of the papers have their references beside them
+(``max_depth`` 6); the references of our scenes are rendered by ``auto`` first and kept in
 ``out/denoiser_guides``. ``--picture`` writes the two albedos of the last scene, side by side.
 """
 

@@ -7,7 +7,7 @@ A pixel becomes the mean of those neighbours from which a t-test does not tell i
 channel, weighted by distance, albedo and normal. The test takes the moments of transformed samples
 y = 2 √x (Box-Cox, λ = 1/2), and corrects their mean for skewness (Johnson 1978). ``path`` renders
 the samples, one image for each. The table has FLIP, and relMSE in brackets; scenes and references
-are those of ``denoiser_guides.py``.
+are the same as in ``denoiser_guides.py``.
 """
 
 from __future__ import annotations

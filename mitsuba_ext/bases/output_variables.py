@@ -67,7 +67,7 @@ class OutputVariables:
             raise ValueError(f'"{self._plugin}": the parameter "aovs": {error}') from None
 
     def names(self) -> list[str]:
-        """The names of the channels: first those of expressions, then Mitsuba's.
+        """The names of the channels: first the channels of expressions, then Mitsuba's.
 
         Raises:
             ValueError: They depend on the scene, and none was looked at.
@@ -92,7 +92,7 @@ class OutputVariables:
         return self._by_mitsuba.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def _expressions(self) -> Mapping[str, Expression]:
-        """All expressions, also those of light groups."""
+        """All expressions, including the expressions of light groups."""
         if not self._list.groups:
             return self._list.expressions
         if self._groups is None:

@@ -195,7 +195,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     @property
     def has_expressions(self) -> bool:
-        """Whether its channels are those of light path expressions."""
+        """Whether it has channels of light path expressions."""
         return False
 
     def look_at(self, scene: mi.Scene) -> None:

@@ -157,7 +157,7 @@ def channel_names(masks: Sequence[tuple[str, str]]) -> list[str]:
 def _summed(
     pixel: np.ndarray, label: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sorted entries, with those of the same pixel and label summed."""
+    """Sorted entries; entries of the same pixel and label are summed."""
     if not len(pixel):
         return pixel, label, weight
     is_new = (np.diff(pixel) != 0) | (np.diff(label) != 0)

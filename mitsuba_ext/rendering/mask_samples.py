@@ -63,7 +63,7 @@ class MaskSamples:
         self.taken.append((rays.position, weight, label))
 
     def put(self) -> None:
-        """Adds the samples taken, which are evaluated together with those of the image."""
+        """Adds the samples taken, which are evaluated together with the samples of the image."""
         for position, weight, label in self.taken:
             self._weights.put(position, weight, label)
         self.taken.clear()

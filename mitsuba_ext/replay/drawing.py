@@ -41,7 +41,7 @@ class Projection:
     def __init__(self, sensor: mi.Sensor) -> None:
         if (kind := sensor.class_name()) not in _CAMERAS:
             raise NotImplementedError(
-                f'paths cannot be drawn over the image of the sensor "{kind}": only over those of '
+                f'paths cannot be drawn over the image of the sensor "{kind}", only over images of '
                 f'"perspective" and "thinlens"'
             )
         film, values = sensor.film(), mi.traverse(sensor)

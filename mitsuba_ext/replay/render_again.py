@@ -104,7 +104,7 @@ def bright_pixels(
 
 
 class _Render:
-    """A render that is to be taken again. The parameters are those of :func:`paths_of_pixels`."""
+    """A render that is to be taken again. For its parameters, see :func:`paths_of_pixels`."""
 
     def __init__(
         self, scene: mi.Scene, integrator: mi.Integrator | None, sensor: mi.Sensor, seed: int,

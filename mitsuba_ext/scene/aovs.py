@@ -98,7 +98,7 @@ class Aovs:
         return cls(",".join(by_mitsuba), expressions, tuple(groups), tuple(masks))
 
     def of_groups(self, groups: list[str]) -> dict[str, Expression]:
-        """All expressions: also those of the items for light groups, for these groups."""
+        """All expressions, including the expressions for these light groups."""
         found = dict(self.expressions)
         for name in self.groups:
             for group in groups:

@@ -24,8 +24,8 @@ NODE_WORDS = 8
 HALVINGS = 5
 MOST_CHILDREN = 1 << HALVINGS
 
-#: After so many halvings, all further halves have equal numbers of lights: lights whose distances
-#: range over many orders of magnitude would make deep trees.
+#: After this number of halvings, all further halves have equal numbers of lights: lights whose
+#: distances range over many orders of magnitude would make deep trees.
 _MIDDLE_ROUNDS = 32
 
 #: Added to the angles of cones, for rounding.
@@ -86,7 +86,7 @@ class Trees:
     depth: int
 
     def padded(self, nodes: int, lights: int) -> Trees:
-        """The same trees, in arrays that have room for so many nodes and lights."""
+        """The same trees, in arrays that have room for these numbers of nodes and lights."""
         arrays = (self.nodes, nodes), (self.link, nodes), (self.parent, nodes), (self.leaf, lights)
         return Trees(*map(_padded, *zip(*arrays)), self.roots, self.depth)
 

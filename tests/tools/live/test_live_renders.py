@@ -168,7 +168,7 @@ def test_the_variance_of_parts_is_the_variance_of_their_mean():
     rng = np.random.default_rng(1)
     increments, total, weight = Increments(), np.zeros((40, 50, 3)), np.zeros((40, 50, 1))
     for spp in (2, 2, 4, 1, 8, 3):
-        for _ in range(spp):  # weights differ, as those of a filter
+        for _ in range(spp):  # weights differ, as with a filter
             weights = rng.uniform(0.5, 1.5, (40, 50, 1))
             total += weights * rng.normal(1, 0.5, (40, 50, 3))
             weight += weights

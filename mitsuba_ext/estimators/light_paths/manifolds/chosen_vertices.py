@@ -12,7 +12,7 @@ from ....transport.path_program import Subpaths
 from ....transport.vertex import Vertex
 from ..stored_interaction import as_float, from_words, interaction_words, to_words
 
-#: The bits of a random number. Seeds of so few bits would repeat in large renders.
+#: The bits of a random number. Seeds of 24 bits would repeat in large renders.
 _BITS = 24
 
 #: The number of the hash by which a vertex is chosen.

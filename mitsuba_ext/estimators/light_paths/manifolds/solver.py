@@ -28,8 +28,8 @@ _LEAST_SHARE = 1 / 64
 #: Two trials have found the same chain if their first directions differ by less than this angle:
 #: more than rounding, less than the distance of different chains.
 _SAME = 3e-4
-#: A lane takes so many tasks, one after the other: see :meth:`Solver.find`. (pool: 2.5 times as
-#: fast as one task for each lane.)
+#: The number of tasks that a lane takes, one after the other: see :meth:`Solver.find`. (pool: 2.5
+#: times as fast as one task for each lane.)
 _TASKS_PER_LANE = 16
 #: Trials end here. In pool, one chain in 10^6 needs more.
 _MOST_TRIALS = 1 << 16

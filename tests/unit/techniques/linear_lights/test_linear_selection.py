@@ -18,9 +18,7 @@ from tests.support.light_choices import (
     mixed_lights,
     panel,
     point,
-    select,
     translate,
-    vertex_at,
 )  # fmt: skip
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor
 from tests.support.statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
@@ -153,38 +151,7 @@ def test_where_no_light_contributes_the_choice_is_uniform():
     np.testing.assert_allclose(list(counts.values()), LANES / 4, rtol=0.05)
 
 
-def test_sampling_weight_is_a_factor():
-    scene = floor(
-        diffuse(),
-        three=point(0, 0.5, 1, sampling_weight=3.0),
-        one=point(0, -0.5, 1),
-        none=point(0, 0, 0.5, sampling_weight=0.0),
-    )
-    counts = _counts(scene)
-    assert counts["three"] / counts["one"] == pytest.approx(3, rel=0.05)
-    assert counts["none"] == 0
-
-
-# ---- Many, one, none ----
-
-
-def test_a_thousand_lamps_estimate_the_sum_of_a_thousand_lamps():
-    rng = np.random.default_rng(1)
-    positions = rng.uniform([-2, -2, -1], [2, 2, 3], (1000, 3))
-    intensities = 10 ** rng.uniform(-2, 2, 1000)
-    scene = floor(
-        diffuse(),
-        **{f"p{i:04}": point(*p, intensity=w)
-           for i, (p, w) in enumerate(zip(positions.tolist(), intensities.tolist()))},
-    )  # fmt: skip
-    si = vertex_at(scene, [0.5, 0, 1], [0, 0, 0])
-    ds, weight, _state = select(LinearChoice(scene), scene, si)
-    value = (weight.x * dr.maximum(si.to_local(ds.d).z, 0)).numpy().astype(np.float64)
-    d2 = (positions**2).sum(axis=1)
-    exact = (intensities * np.maximum(positions[:, 2], 0) / d2**1.5).sum()
-    assert abs(value.mean() - exact) < 4 * value.std() / np.sqrt(LANES)
-    # Nearly as good as the exact probabilities, which have no variance at all
-    assert value.std() < 0.3 * exact
+# ---- One, none ----
 
 
 def test_one_emitter_needs_no_estimates_and_no_emitter_needs_no_tables():
