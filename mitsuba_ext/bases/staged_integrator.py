@@ -124,6 +124,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """The memory of a sample in a pass."""
         return SampleBytes()
 
+    @property
+    def channel_bytes(self) -> int:
+        """The memory of a sample in a pass for the channels of light path expressions."""
+        return 0
+
     def samples_per_set(self, spp: int) -> int:
         """How many of the ``spp`` samples of a pixel form a set, in a render with a timeout, which
         does not stop within a set."""

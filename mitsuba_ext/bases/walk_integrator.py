@@ -239,6 +239,10 @@ class WalkIntegrator(StagedIntegrator):
     def sample_bytes(self) -> SampleBytes:
         return SampleBytes(max((t.sample_bytes for t in self.slots.values()), default=0))
 
+    @property
+    def channel_bytes(self) -> int:
+        return 0 if self.channels is None else self.channels.sample_bytes
+
     def samples_per_set(self, spp: int) -> int:
         return max((t.samples_per_set(spp) for t in self.slots.values()), default=1)
 

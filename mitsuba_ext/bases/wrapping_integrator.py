@@ -90,6 +90,10 @@ class WrappingIntegrator(StagedIntegrator):
         return self.nested.sample_bytes if self._is_staged else super().sample_bytes
 
     @property
+    def channel_bytes(self) -> int:
+        return self.nested.channel_bytes if self._is_staged else 0
+
+    @property
     def needs_equal_samples(self) -> str:
         return self.nested.needs_equal_samples if self._is_staged else ""
 

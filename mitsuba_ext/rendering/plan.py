@@ -4,7 +4,7 @@ passes."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
@@ -120,7 +120,9 @@ def plan_render(
     check_extent(film)
     pixel_count = math.prod(film_extent(film))
     structured = not is_independent(request.sensor)
-    cost, most_lanes = integrator.sample_cost, device.lanes(integrator.sample_bytes)
+    sample, channels = integrator.sample_bytes, integrator.channel_bytes
+    sample = replace(sample, usual=sample.usual + channels)
+    cost, most_lanes = integrator.sample_cost, device.lanes(sample)
     limit = device.pass_samples // (pixel_count * cost)
     if not structured and not device.is_gpu:
         limit = max(limit, min(_PASS_SPP // cost, device.most_pass_samples // pixel_count))

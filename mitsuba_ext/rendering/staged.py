@@ -42,6 +42,10 @@ class Staged(Protocol):
     def sample_bytes(self) -> SampleBytes:
         """The memory of a sample in a pass."""
 
+    @property
+    def channel_bytes(self) -> int:
+        """The memory of a sample in a pass for the channels of light path expressions."""
+
     def samples_per_set(self, spp: int) -> int:
         """The number of samples of a pixel that a timeout must not separate."""
 

@@ -47,6 +47,10 @@ from .vertex import PathState, Vertex
 #: The kinds of lobes, in the order of the alphabet's symbols, and their number.
 _DIFFUSE, _GLOSSY, _SPECULAR, _KINDS = 0, 1, 2, 3
 
+#: Bytes of the result of a path, which is stored until the channels are read, and of its random
+#: numbers.
+_RESULT_BYTES = 64
+
 
 # Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
 class PathChannels:
@@ -87,6 +91,11 @@ class PathChannels:
         self._undivided = undivided_bsdfs(scene) if self._mixes else None
         self._ctx = Heroes(scene).context()
         self._lane, self._sums = mi.UInt32(0), _Sums(1)
+
+    @property
+    def sample_bytes(self) -> int:
+        """The memory of a sample in a pass: its sums, and the result of its path."""
+        return self._cells * _Sums.bytes_each() + _RESULT_BYTES
 
     def kernel_state(self) -> tuple:
         """The attributes that kernels depend on; a pass makes the others."""
@@ -327,8 +336,13 @@ class _Sums:
     """
 
     def __init__(self, count: int) -> None:
-        self._packet = 1 if len(mi.Spectrum()) == 1 else 4
+        self._packet = self.bytes_each() // 4
         self._words = dr.zeros(mi.Float, count * self._packet)
+
+    @staticmethod
+    def bytes_each() -> int:
+        """The memory of a sum."""
+        return 4 if len(mi.Spectrum()) == 1 else 16
 
     def add(self, index: mi.UInt32, words: list[mi.Float], active: mi.Bool) -> None:
         """Adds a spectrum."""

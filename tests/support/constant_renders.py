@@ -73,6 +73,7 @@ class TwoStages:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.is_cancelled, self.masks = False, ()
         self.name, self.sample_cost, self.sample_bytes = "two_stages", 1, SampleBytes()
+        self.channel_bytes = 0
 
     def plan_learning(self, request, spp):
         return Learning((self.pilot_spp,))

@@ -7,6 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering.device import device_of
+from mitsuba_ext.transport.path_channels import PathChannels
+
 pytestmark = pytest.mark.usefixtures("variant")
 
 #: A partition of all paths, and what it adds up to.
@@ -52,6 +55,14 @@ def test_a_partition_adds_up_to_the_image_which_is_the_same_as_without_channels(
     np.testing.assert_allclose(sum(channels.values()), image, atol=2e-5)
     assert all(channels[name].mean() > 1e-3 for name in ("em", "di", "gl", "tr"))
     assert not channels["vo"].any()
+
+
+def test_a_partition_adds_up_where_memory_suffices_for_a_part_of_the_film_only(monkeypatch) -> None:
+    half = device_of(mi.Float).pass_bytes // (12 * 12 // 2)
+    monkeypatch.setattr(PathChannels, "sample_bytes", half)
+    image, channels = _render(_box(), PARTITION, spp=4)
+    np.testing.assert_allclose(sum(channels.values()), image, atol=2e-5)
+    assert (image.sum(axis=2) > 0).any(axis=1).all()
 
 
 def test_a_channel_without_a_lobe_is_the_image_of_a_scene_without_it() -> None:
