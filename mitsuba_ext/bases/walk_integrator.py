@@ -25,7 +25,7 @@ from ..rendering.device import SampleBytes
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
-from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
+from ..scene.media import refuse_media, refuse_moving_grids
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
 from ..transport.estimator import CameraRays, Estimator
@@ -469,4 +469,3 @@ class WalkIntegrator(StagedIntegrator):
                 default = next(iter(SLOTS[slot]))
                 refuse_media(scene, what, f'choose another one, such as "{default}"')
         refuse_moving_grids(scene, f'"{self.name}"')
-        refuse_missing_colours(scene, f'"{self.name}"')

@@ -58,6 +58,17 @@ def extinction_varies(scene: mi.Scene) -> bool:
     return any(_extinction_varies(medium, box) for medium, box in found.values())
 
 
+def may_be_chromatic(scene: mi.Scene) -> bool:
+    """Like :func:`extinction_varies`, but also true where that cannot be found out: for media in
+    instances, and while a user records a whole render (``dr.freeze``), when no array can be
+    read."""
+    if mi.is_monochromatic or not may_have_media(scene):
+        return False
+    if has_instances(scene) or dr.flag(dr.JitFlag.FreezingScope):
+        return True
+    return extinction_varies(scene)
+
+
 def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
     """Raises an error if there are media in ``scene``.
 
@@ -88,27 +99,6 @@ def refuse_moving_grids(scene: mi.Scene, what: str) -> None:
             f"{what}: a shape that moves encloses a grid medium, which would stay where it is: "
             f'use a "homogeneous" medium.'
         )
-
-
-def refuse_missing_colours(scene: mi.Scene, what: str) -> None:
-    """Raises an error if a medium has no extinction in one colour: distances that are sampled with
-    this colour never end in the medium.
-
-    Parameters:
-        what: The beginning of the message.
-
-    Raises:
-        NotImplementedError: A homogeneous medium has an extinction of zero in some colours only.
-    """
-    if not mi.is_rgb:
-        return
-    for medium in _media(scene):
-        σ = medium.get_majorant(dr.zeros(mi.MediumInteraction3f), True).numpy()
-        if medium.is_homogeneous() and σ.min() <= 0 < σ.max():
-            raise NotImplementedError(
-                f"{what}: a medium has no extinction in some colours: give these a small one, such "
-                f'as 1e-2 of the largest, or use "volpathmis".'
-            )
 
 
 def _media(scene: mi.Scene) -> Iterator[mi.Medium]:

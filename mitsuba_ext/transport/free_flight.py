@@ -70,6 +70,12 @@ def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
     return mi.Spectrum(dr.select(σ == 0, 1, dr.exp(-t * σ)))
 
 
+def shared_mean(value: mi.UnpolarizedSpectrum, shares: mi.UnpolarizedSpectrum | None) -> mi.Float:
+    """The mean of ``value`` over colours that have the probabilities ``shares``; ``None`` if these
+    are equal."""
+    return channel_mean(value) if shares is None else dr.dot(value, shares)
+
+
 @dr.syntax
 def track(
     sampler: mi.Sampler,
@@ -77,6 +83,7 @@ def track(
     end: mi.Float,
     medium: mi.MediumPtr,
     channel: mi.UInt32,
+    shares: mi.UnpolarizedSpectrum | None,
     t: mi.Float,
     β: mi.Spectrum,
     active: mi.Bool,
@@ -86,6 +93,8 @@ def track(
     Parameters:
         ray, end: The ray, and the distance of the surface that it hits.
         medium, channel: The medium, and the colour whose extinction chooses distances.
+        shares: The probability with which each colour chooses whether a collision is real, in
+            scenes with chromatic media; ``None`` in others, where all are equal.
         t, β: Returned where not ``active``; ``β`` is the throughput at the origin of the ray.
         active: Whether the ray begins in a medium of varying density.
 
@@ -107,12 +116,16 @@ def track(
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint
         weight = attenuation(σ - chosen, flown) * dr.select(is_inside, dr.rcp(chosen), 1)
         # Whether the collision is real
-        passing = channel_mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
+        passing = shared_mean(dr.select(σ > 0, mei.sigma_n / σ, 0), shares)
         is_null = is_inside & (sampler.next_1d(is_inside) < passing)
         is_real = is_inside & ~is_null
         weight *= dr.select(is_null, mei.sigma_n / passing, 1)
-        real = channel_mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
+        real = shared_mean(dr.select(σ > 0, mei.sigma_t / σ, 0), shares)
         weight *= dr.select(is_real, mei.sigma_s / real, 1)
+        if dr.hint(shares is not None, mode="scalar"):
+            # In proportion to the throughput
+            carried = shares * dr.select(is_null, weight, 1)
+            shares = carried * dr.rcp(dr.sum(carried))
         β = dr.select(active, β * mi.Spectrum(weight), β)
         t = dr.select(is_real, dr.norm(mei.p - start), t)
         collides |= is_real

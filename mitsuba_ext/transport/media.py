@@ -27,7 +27,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.media import may_have_grids, may_have_media
 from .estimator import CameraRays
 from .free_flight import Distances, attenuation, component, extinction, interaction_at, track
 from .hidden_emitters import behind_emitters
@@ -45,12 +44,15 @@ class Inside:
         channel: The colour whose extinction chooses distances.
         reach: The distance at which a homogeneous medium scatters, if no surface is closer.
         distances: The state of the decision that chooses distances (:class:`Distances`).
+        shares: The probability with which each colour chooses the next distance, in scenes with
+            chromatic media; ``None`` in others, where one colour chooses all distances of a path.
     """
 
     medium: mi.MediumPtr
     channel: mi.UInt32
     reach: mi.Float
     distances: Any
+    shares: mi.UnpolarizedSpectrum | None = None
 
 
 class NoMedia:
@@ -71,9 +73,9 @@ class NoMedia:
         """The state of camera rays."""
         return None
 
-    def launch(self, inside, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
+    def launch(self, inside, β, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
         """``ray``, shortened to the distance at which a homogeneous medium scatters, and the state.
-        ``rays`` are the camera rays of the paths."""
+        ``rays`` are the camera rays of the paths, ``β`` is what a path carries along ``ray``."""
         return ray, inside
 
     def behind(
@@ -172,19 +174,19 @@ class Media(NoMedia):
         distances = self._distances.begin(rays)
         return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
-    def launch(self, inside, sampler, rays, ray, active):
+    def launch(self, inside, β, sampler, rays, ray, active):
         if not self._distances.scatter:
             return ray, inside
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
-        σ = component(extinction(inside.medium, ray, known), inside.channel)
+        σ = self._rate(extinction(inside.medium, ray, known), inside)
         # 1 − u > 0; an extinction of 0 gives an infinite distance
         u, distances = self._distances.draw(inside.distances, sampler, rays, known)
         t = -dr.log(1 - u) / σ
         reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.minimum(ray.maxt, reach)
-        return ray, Inside(inside.medium, inside.channel, reach, distances)
+        return ray, replace(inside, reach=reach, distances=distances)
 
     def behind(self, query, scene, ray, pi, active):
         last, behind = behind_emitters(query, scene, ray, pi, active)
@@ -200,21 +202,32 @@ class Media(NoMedia):
         σ = extinction(inside.medium, ray, is_homogeneous)
         scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
         t = dr.minimum(inside.reach, si.t)
-        chosen = component(σ, inside.channel)
-        # Relative to the probability of getting this far
-        ratio = attenuation(σ - chosen if self._distances.scatter else σ, t)
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` draws whether the collision is real
-        weight = ratio * dr.select(scatters, σ_s / chosen, 1)
+        weight = self._flown(σ, σ_s, t, scatters, inside)
         β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
         # ----- Media of varying density -----
         if self._has_grids:
             tracks = in_medium & ~is_homogeneous
-            t, β, collides = track(sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks)
+            t, β, collides = track(
+                sampler, ray, si.t, inside.medium, inside.channel, inside.shares, t, β, tracks
+            )
             scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
         return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
+
+    def _rate(self, σ, inside):
+        """The extinction ``σ`` with which the distance of a flight is sampled."""
+        return component(σ, inside.channel)
+
+    def _flown(self, σ, σ_s, t, scatters, inside):
+        """What a flight to the distance ``t`` in a homogeneous medium multiplies the throughput
+        by."""
+        chosen = component(σ, inside.channel)
+        # Relative to the probability of getting this far
+        ratio = attenuation(σ - chosen if self._distances.scatter else σ, t)
+        return ratio * dr.select(scatters, σ_s / chosen, 1)
 
     def meets(self, pi, inside):
         # A path may scatter although no surface ends its ray
@@ -313,13 +326,6 @@ class Media(NoMedia):
         if not self._hides:
             return emitted
         return dr.select(path.depth == 0, 0, emitted)
-
-
-def media_of(scene: mi.Scene, hide_emitters: bool, distances: Distances) -> NoMedia:
-    """The object that handles the media of ``scene``."""
-    if not may_have_media(scene):
-        return NoMedia(hide_emitters)
-    return Media(hide_emitters, distances, may_have_grids(scene))
 
 
 def eval_phase(

@@ -92,7 +92,13 @@ class SceneQuery:
 
     Parameters (and attributes):
         starts: Where rays that leave a surface start; by default, the same as in Mitsuba.
+
+    Attributes:
+        has_chromatic_media: Whether the extinction of a medium may vary between colours. A render
+            examines this before kernels are traced, where arrays cannot be read.
     """
+
+    has_chromatic_media = False
 
     def __init__(self, starts: RayStarts = RayStarts()) -> None:  # noqa: B008  (never modified)
         self.starts = starts

@@ -18,11 +18,11 @@ import mitsuba as mi
 
 from ..startup.garbage import garbage_left_alone
 from ..util.arrays import channel_mean
+from .chromatic_media import media_of
 from .connection import Connection, Connector, can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes
-from .media import media_of
 from .numbers import schedule_state
 from .observer import Observer
 from .path_channels import PathChannels
@@ -131,7 +131,7 @@ class Walk:
         can_hit_emitters = has_emitters and can_be_hit(scene)
         sees_environment = scene.environment() is not None and not self.hide_emitters
 
-        media = media_of(scene, self.hide_emitters, self.distance)
+        media = media_of(scene, self.hide_emitters, self.distance, self.query.has_chromatic_media)
         heroes = Heroes(scene, rays.hero_weight)
         ctx = heroes.context()
         connector = Connector(
@@ -170,7 +170,7 @@ class Walk:
         self.observer.camera(rays)
 
         inside = media.begin(sampler, rays)
-        ray, inside = media.launch(inside, sampler, rays, ray, active)
+        ray, inside = media.launch(inside, path.β, sampler, rays, ray, active)
         pi = self.query.closest(scene, ray, coherent=media.coherent, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
             ray, pi = media.behind(self.query, scene, ray, pi, active)
@@ -306,7 +306,7 @@ class Walk:
             active = active_next & (~rr_active | rr_continue) & carries
             path.β[rr_active] *= dr.rcp(survival)
 
-            ray, inside = media.launch(inside, sampler, rays, ray, active)
+            ray, inside = media.launch(inside, path.β, sampler, rays, ray, active)
             pi = self.query.closest(scene, ray, coherent=False, active=active)
             if dr.hint(media.exist and self.hide_emitters, mode="scalar"):
                 ray, pi = media.behind(self.query, scene, ray, pi, active & (path.depth == 0))

@@ -11,11 +11,12 @@ import mitsuba as mi
 
 from ...rendering.device import device_of
 from ...startup.garbage import garbage_left_alone
+from ...transport.chromatic_media import media_of
 from ...transport.estimator import CameraRays
 from ...transport.free_flight import Distances
 from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
-from ...transport.media import NoMedia, media_of
+from ...transport.media import NoMedia
 from ...transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import Roulette, SceneQuery
@@ -290,7 +291,10 @@ class LightWalk:
             # ----- Move on to the next vertex -----
             ray = self.query.starts.along(si, si.to_world(bs.wo))
             inside = media.cross(paths.inside, si, ray.d)
-            ray, inside = media.launch(inside, numbers, CameraRays(ray), ray, active_next)
+            carried = paths.emitted * β
+            ray, inside = media.launch(
+                inside, carried, numbers, CameraRays(ray), ray, active_next
+            )
             pi = self.query.closest(scene, ray, coherent=False, active=active_next)
             scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
             active_next &= media.meets(pi, inside) & (scatter_count < _MOST_BOUNCES)
@@ -310,7 +314,7 @@ class LightWalk:
         """The object that handles media."""
         if self.outside is None:
             return NoMedia()
-        return media_of(scene, False, Distances())
+        return media_of(scene, False, Distances(), self.query.has_chromatic_media)
 
     def _launch(self, scene, numbers, emitted: EmittedRay, active) -> tuple[mi.Ray3f, Any]:
         """An emitted ray, which ends where it scatters in a medium, and the state there."""
@@ -322,7 +326,7 @@ class LightWalk:
         inside = media.begin(numbers, rays)
         # States of a loop have the width of its lanes
         inside.channel = inside.channel + dr.zeros(mi.UInt32, dr.width(medium))
-        return media.launch(inside, numbers, rays, emitted.ray, active)
+        return media.launch(inside, emitted.weight, numbers, rays, emitted.ray, active)
 
     def _is_stored(self, media: NoMedia, vertex: Vertex, stores) -> mi.Bool:
         """Whether ``vertex`` is stored."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ...scene.lightweight_shapes import lightweight_shapes
+from ...scene.media import may_be_chromatic
 from ...scene.movers import movers
 from ..scene_query import SceneQuery, ray_starts
 from .lightweight_scene import LightweightQuery
@@ -27,4 +28,6 @@ def scene_query(scene: mi.Scene) -> SceneQuery:
             "scene only, and shapes that move are scenes of their own"
         )
     query = MovingSceneQuery(scene, moving, starts) if moving else SceneQuery(starts)
-    return LightweightQuery(query, lightweight) if lightweight else query
+    query = LightweightQuery(query, lightweight) if lightweight else query
+    query.has_chromatic_media = may_be_chromatic(scene)
+    return query
