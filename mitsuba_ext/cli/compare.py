@@ -67,7 +67,7 @@ if TYPE_CHECKING:
 @click.option(
     "--reference-integrator", metavar="INTEGRATOR", shell_complete=candidates.integrators,
     help="Integrator that renders the reference.  [default: path; if that misses light of the "
-    "scene: volpath or volpathmis in media, bdpt for lights that no camera path finds]",
+    "scene: volpath or composed_path in media, bdpt for lights that no camera path finds]",
 )
 @click.option(
     "--no-reference", is_flag=True,

@@ -33,8 +33,8 @@ def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
     cannot render everything in the scene.
 
     ===================================  ========================================================
-    media                                ``volpath``, or ``volpathmis`` if their extinction is
-                                         coloured
+    media                                ``volpath``, or ``composed_path`` if their extinction is
+                                         coloured (``volpathmis`` loses light behind roulette)
     light that no camera path finds      ``bdpt``, where it can render the scene
     ``moving`` or lightweight shapes     ``composed_path``, if none of the others is chosen
     ===================================  ========================================================
@@ -42,8 +42,8 @@ def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
     scene = loaded.scene
     missed = _missed_light(scene, loaded.has_media)
     if loaded.has_media:
-        name = "volpathmis" if extinction_varies(scene) else "volpath"
-        name = "composed_path" if has_unseen_shapes(scene) else name
+        by_us = extinction_varies(scene) or has_unseen_shapes(scene)
+        name = "composed_path" if by_us else "volpath"
         why = f'"{name}" renders the reference: the scene has participating media'
         return ReferenceChoice(name, (why, *_lacks(missed, '"bdpt" does not see media')))
     if missed and _takes_light_paths(loaded):

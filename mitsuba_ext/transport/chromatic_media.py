@@ -44,10 +44,7 @@ class ChromaticMedia(Media):
         return super().launch(inside, β, sampler, rays, ray, active)
 
     def _rate(self, σ, inside):
-        rate = σ[0]
-        for index in range(1, len(σ)):
-            rate = dr.select(inside.channel == index, σ[index], rate)
-        return rate
+        return chosen_rate(σ, inside.channel)
 
     def _flown(self, σ, σ_s, t, scatters, inside):
         T = attenuation(σ, t)
@@ -67,6 +64,14 @@ def media_of(
         return NoMedia(hide_emitters)
     kind = ChromaticMedia if is_chromatic else Media
     return kind(hide_emitters, distances, may_have_grids(scene))
+
+
+def chosen_rate(σ: mi.UnpolarizedSpectrum, channel: mi.UInt32) -> mi.Float:
+    """The colour (or wavelength) ``channel`` of an extinction."""
+    rate = σ[0]
+    for index in range(1, len(σ)):
+        rate = dr.select(channel == index, σ[index], rate)
+    return rate
 
 
 def _shares(β: mi.Spectrum) -> mi.UnpolarizedSpectrum:

@@ -20,9 +20,17 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ....transport.free_flight import Distances, attenuation, component, extinction, interaction_at
+from ....transport.chromatic_media import chosen_rate
+from ....transport.free_flight import (
+    Distances,
+    attenuation,
+    component,
+    extinction,
+    interaction_at,
+    shared_mean,
+)
 from ....transport.heroes import Heroes
-from ....transport.media import eval_phase
+from ....transport.media import Inside, eval_phase
 from ....transport.path_channels import PathChannels
 from ....transport.path_program import Subpaths
 from ....transport.vertex import PathState, Vertex
@@ -104,7 +112,10 @@ class MergedInMedia(MergedSubpaths):
         searches = active & (medium != None)  # noqa: E711
         searches &= medium.is_homogeneous()
         σ = extinction(medium, ray, searches)
-        chosen = component(σ, inside.channel)
+        rates = _rates(σ, inside)
+        chosen = component(σ, inside.channel) if rates is None else chosen_rate(
+            rates, inside.channel
+        )
         searches &= chosen > 0
         mei = interaction_at(ray, ray.o, medium)
         σ_s, _, _ = medium.get_scattering_coefficients(mei, searches)
@@ -113,7 +124,9 @@ class MergedInMedia(MergedSubpaths):
         sample, number = sampler.next_1d(searches), mi.UInt32(0)
         t = _distance(number, sample, scattered, chosen)
         σ_s = mi.Spectrum(σ_s)
-        weight = σ_s * dr.select(chosen > 0, scattered / chosen, 0)
+        weight = σ_s
+        if dr.hint(rates is None, mode="scalar"):
+            weight *= dr.select(chosen > 0, scattered / chosen, 0)
         weight *= path.β * (self._per_vertex / _POINTS)
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
@@ -136,7 +149,12 @@ class MergedInMedia(MergedSubpaths):
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
                 other = self._vertices.at(near[0], exists)
-                value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
+                value = self._flux(mei, path, other, exists)
+                if dr.hint(rates is None, mode="scalar"):
+                    value *= attenuation(σ - chosen, far[0])
+                else:
+                    density = _density(rates, inside.shares, far[0], si.t)
+                    value *= attenuation(σ, far[0]) / density
                 gathered += value
                 if dr.hint(self._channels is not None, mode="scalar"):
                     self._channels.joined_in_medium(path, other.events, value * weight, exists)
@@ -186,6 +204,20 @@ class MergedInMedia(MergedSubpaths):
         value *= other.β
         active &= dr.all(dr.isfinite(value))
         return dr.select(active, value, 0)
+
+
+def _rates(σ: mi.UnpolarizedSpectrum, inside: Inside) -> mi.UnpolarizedSpectrum | None:
+    """With chromatic media, the rate with which each colour samples distances: its extinction,
+    where that is not so small that light of other colours would be missed; else ``None``."""
+    return None if inside.shares is None else dr.maximum(σ, 1e-3 * dr.max(σ))
+
+
+def _density(
+    rates: mi.UnpolarizedSpectrum, shares: mi.UnpolarizedSpectrum, t: mi.Float, end: mi.Float
+) -> mi.Float:
+    """The density with which all colours together sample the distance ``t``, up to ``end``."""
+    scattered = [_absorbed(rates[index] * end) for index in range(len(rates))]
+    return shared_mean(rates * dr.exp(-rates * t) / mi.UnpolarizedSpectrum(scattered), shares)
 
 
 def _absorbed(τ: mi.Float) -> mi.Float:
