@@ -14,9 +14,10 @@ from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import refuse_geometry
+from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
-from mitsuba_ext.transport.replay import Replay
+from mitsuba_ext.transport.replay import FirstPass, Replay
 
 # Mitsuba executes this module again for each variant, but perhaps not yet for this one
 common = importlib.reload(common)
@@ -126,7 +127,7 @@ class ComposedPRB(common.RBIntegrator):
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
-        self._pixel_count = 1
+        self._pixel_count, self._medium = 1, None
 
     @property
     def statistics(self):
@@ -170,17 +171,18 @@ class ComposedPRB(common.RBIntegrator):
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
-        self._pixel_count = width * height
+        self._pixel_count, self._medium = width * height, sensor.get_medium()
         return super().prepare(sensor, seed, spp, list(aovs))
 
     def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
         lanes = dr.width(ray)
         pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
-        rays, walk = CameraRays(ray, pixel), self._for_gradients.remembered(scene)
-        replay = None
+        rays = CameraRays(ray, pixel, medium=self._medium)
+        walk = self._for_gradients.remembered(scene)
+        replay = FirstPass() if may_have_media(scene) else None
         if mode != dr.ADMode.Primal:
             replay = Replay(scene, state_in, δL if mode == dr.ADMode.Backward else None)
-            walk = replace(walk, replay=replay)
+        walk = replace(walk, replay=replay)
         sample = walk(scene, sampler, rays, mi.Bool(active))
         if mode == dr.ADMode.Forward:
             return replay.derivative, sample.valid, [], None

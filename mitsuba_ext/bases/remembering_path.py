@@ -16,7 +16,6 @@ from ..planning.technique import Setting, decisions_of
 from ..rendering.stages import OneStage, ReportedSchedule
 from ..rendering.statistics import RenderStatistics
 from ..scene.mark import SceneMark
-from ..scene.media import refuse_media
 from ..scene.movers import movers
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
@@ -139,7 +138,6 @@ class RememberingPath(WalkIntegrator):
         statistics.learned, statistics.effects = self._remembered.said
 
     def query(self, scene):
-        refuse_media(scene, f'"{self.name}"', 'use "prbvolpath"')
         if movers(scene):
             raise NotImplementedError(
                 f'"{self.name}": there are no gradients of scenes with moving shapes or cameras'

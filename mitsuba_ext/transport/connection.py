@@ -23,7 +23,7 @@ from .path_decisions import (
     Weights,
 )
 from .path_program import PathProgram
-from .replay import Replay
+from .replay import FirstPass
 from .vertex import PathState, Vertex
 
 #: The golden ratio: its multiples, modulo one, are evenly spread.
@@ -65,7 +65,7 @@ class Connector:
         program: PathProgram,
         observer: Observer,
         media: NoMedia,
-        replay: Replay | None = None,
+        replay: FirstPass | None = None,
         channels: PathChannels | None = None,
     ) -> None:
         self._media, self._replay, self._channels = media, replay, channels
@@ -147,15 +147,17 @@ class Connector:
         weight, tested, state = self._roulette(state, connection, survival_sample, si, tested)
         value *= weight
         if self._media.exist:
-            T = self._media.transmittance(
-                self._query, self._scene, vertex, ds, inside, sampler, tested
-            )
+            T, way = self._media.transmittance(
+                self._query, self._scene, vertex, ds, inside, self._replay is not None, sampler,
+                tested,
+            )  # fmt: skip
             value, contribution = value * T, contribution * T
             visible = tested & (dr.max(T) > 0)
         else:
+            T, way = 1.0, None
             visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
         if self._replay is not None:
-            self._replay.connected(vertex, ds, β * (mis * weight), visible)
+            self._replay.connected(vertex, ds, β * (mis * weight) * T, visible, way)
         if self._channels is not None:
             self._channels.connected(vertex, ds, value, visible)
         self._observer.connection(

@@ -31,7 +31,7 @@ from .estimator import CameraRays
 from .free_flight import Distances, attenuation, component, extinction, interaction_at, track
 from .hidden_emitters import behind_emitters
 from .path_decisions import SceneQuery
-from .transmittance import transmittance
+from .transmittance import Way, transmittance
 from .vertex import Arrival, MediumVertex, PathState, Vertex
 
 
@@ -142,8 +142,14 @@ class NoMedia:
     def visible_emission(self, emitted, path: PathState, si, scattered) -> mi.Spectrum:
         """The emission that a path gains from the light that it hits at ``si``. ``scattered`` tells
         whether the path has scattered before, not only passed through null surfaces."""
+        if not self._hides:
+            return emitted
+        return dr.select(self.sees_light(path, si, scattered), emitted, 0)
+
+    def sees_light(self, path: PathState, si, scattered) -> mi.Bool:
+        """Whether a path sees the light at ``si`` although lights are hidden."""
         # The path does not meet hidden area lights (``behind``)
-        return dr.select(si.is_valid() | scattered, emitted, 0) if self._hides else emitted
+        return si.is_valid() | scattered
 
 
 # Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
@@ -263,13 +269,13 @@ class Media(NoMedia):
         return dr.select(active, phase_value, value), dr.select(active, phase_pdf, pdf)
 
     def transmittance(
-        self, query, scene, vertex: Vertex, ds, inside, sampler, active
-    ) -> mi.Spectrum:
+        self, query, scene, vertex: Vertex, ds, inside, finds_way: bool, sampler, active
+    ) -> tuple[mi.Spectrum, Way | None]:
         """The transmittance between ``vertex`` and the light sample ``ds``; see
         :func:`transmittance`."""
         return transmittance(
             query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids,
-            self._distances.exact_transmittance, sampler, active,
+            self._distances.exact_transmittance, finds_way, sampler, active,
         )  # fmt: skip
 
     def scatter(self, vertex, sample_1, sample_2, bs, weight):
@@ -322,10 +328,8 @@ class Media(NoMedia):
         medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
         return replace(inside, medium=medium)
 
-    def visible_emission(self, emitted, path, si, scattered):
-        if not self._hides:
-            return emitted
-        return dr.select(path.depth == 0, 0, emitted)
+    def sees_light(self, path, si, scattered):
+        return path.depth != 0
 
 
 def eval_phase(

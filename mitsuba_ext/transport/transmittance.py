@@ -2,11 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
-from .free_flight import attenuation, component, extinction
+from .free_flight import attenuation, component, extinction, interaction_at
 from .path_decisions import SceneQuery
+
+
+@dataclass
+class Way:
+    """The way of light through media, for derivatives of its attenuation.
+
+    Attributes:
+        mei: The interaction with a medium at a random point of the way, uniform by length.
+        length: The length of the way, vacuum not included.
+    """
+
+    mei: mi.MediumInteraction3f
+    length: mi.Float
+
+    def extended(
+        self, u: mi.Float, ray: mi.Ray3f, end: mi.Float, medium: mi.MediumPtr, active: mi.Bool
+    ) -> Way:
+        """The way that goes on, where ``active``, along ``ray`` to ``end`` through ``medium``. The
+        random number ``u`` decides whether its point lies there, and where."""
+        length = self.length + dr.select(active, end, 0)
+        mei = interaction_at(ray, ray(u * length), medium)
+        return Way(dr.select(active & (u * length < end), mei, self.mei), length)
 
 
 @dr.syntax
@@ -19,9 +43,10 @@ def transmittance(
     channel: mi.UInt32,
     has_grids: bool,
     exact: bool,
+    finds_way: bool,
     sampler: mi.Sampler,
     active: mi.Bool,
-) -> mi.Spectrum:
+) -> tuple[mi.Spectrum, Way | None]:
     """An unbiased estimate of the transmittance between a vertex and a point on a light. In
     homogeneous media, it is computed, or estimated with a random distance; in others, it is
     estimated by ratio tracking (Novák et al., section 4.2). It is 0 where a surface that is not
@@ -33,12 +58,14 @@ def transmittance(
         medium, channel: The medium in front of the vertex, and the colour that chooses distances.
         has_grids: Whether there may be media that are not homogeneous.
         exact: Whether the transmittance of homogeneous media is computed without random distances.
+        finds_way: Whether the :class:`Way` of the light is returned as well.
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
     # Media attenuate light from infinity up to Mitsuba's ds.p; surfaces block it at any distance
     left = query.starts.towards(si, ds.p, ds.n).maxt
     T = mi.Spectrum(1)
+    way = Way(dr.zeros(mi.MediumInteraction3f), mi.Float(0)) if finds_way else None
     active = mi.Bool(active)
     while dr.hint(active, label="transmittance"):
         in_medium = active & (medium != None)  # noqa: E711
@@ -56,6 +83,8 @@ def transmittance(
         T = dr.select(is_homogeneous, T * attenuation(rate, end), T)
         if dr.hint(has_grids, mode="scalar"):
             T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
+        if dr.hint(finds_way, mode="scalar"):
+            way = way.extended(sampler.next_1d(in_medium), ray, end, medium, in_medium)
         # ----- Does the surface let it pass? -----
         met = query.interaction(pi, segment)
         is_met &= dr.max(T) > 0
@@ -69,7 +98,7 @@ def transmittance(
         ray = dr.select(is_met, onward, ray)
         left = dr.select(is_met, left - met.t, left)
         active &= is_met & (ray.maxt > 0)
-    return T
+    return T, way
 
 
 def _flight(

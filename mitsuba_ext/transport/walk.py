@@ -38,7 +38,7 @@ from .path_decisions import (
     Weights,
 )
 from .path_program import PathProgram
-from .replay import Replay
+from .replay import FirstPass
 from .vertex import Arrival, PathState, Vertex
 
 
@@ -64,8 +64,7 @@ class Walk:
         program: Follows the paths for the estimator that uses them. It keeps their history, from
             which it computes MIS weights, where paths end, and the light of other subpaths.
         observer: Receives the events of the walk.
-        replay: Propagates derivatives along the paths; ``None`` if they are traced for the first
-            time.
+        replay: Propagates derivatives along the paths, or prepares to; ``None`` for images.
         clamp_direct, clamp_indirect: The largest mean over the channels of the light that a path
             of one or two segments, or all longer ones together, may add to a sample: brighter
             light is scaled to it. 0 for any. (Observers learn of light as it was before.)
@@ -87,7 +86,7 @@ class Walk:
     mis: Weights = field(default_factory=Weights)
     program: PathProgram = field(default_factory=PathProgram)
     observer: Observer = field(default_factory=Observer)
-    replay: Replay | None = None
+    replay: FirstPass | None = None
     clamp_direct: float = 0.0
     clamp_indirect: float = 0.0
     channels: PathChannels | None = None
@@ -182,6 +181,10 @@ class Walk:
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
             path.history = self.program.arrive(path, si)
 
+            if dr.hint(self.replay is not None and media.exist, mode="scalar"):
+                u = sampler.next_1d(active)
+                self.replay.flown(ray, inside.medium, u, si, in_medium, L, active)
+
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
@@ -201,7 +204,7 @@ class Walk:
                 if dr.hint(self.replay is not None, mode="scalar"):
                     seen = active & (path.arrival.pdf > 0)
                     if dr.hint(self.hide_emitters, mode="scalar"):
-                        seen &= si.is_valid() | valid
+                        seen &= media.sees_light(path, si, valid)
                     self.replay.emitted(si, path, mis, hit.emitter, seen)
 
             # ----- Should we continue tracing to reach one more vertex? -----
