@@ -13,7 +13,7 @@ from mitsuba_ext.bases.remembering_path import RememberingPath
 from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.turns import in_turn
-from mitsuba_ext.scene.gradients import refuse_geometry
+from mitsuba_ext.scene.gradients import optimizes_grids, refuse_geometry
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
@@ -127,7 +127,7 @@ class ComposedPRB(common.RBIntegrator):
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
-        self._pixel_count, self._medium = 1, None
+        self._pixel_count, self._medium, self._fills_gaps = 1, None, False
 
     @property
     def statistics(self):
@@ -168,6 +168,7 @@ class ComposedPRB(common.RBIntegrator):
         refuse_geometry(self.name, params)
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
+        self._fills_gaps = optimizes_grids(scene)
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
@@ -179,11 +180,14 @@ class ComposedPRB(common.RBIntegrator):
         pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
         rays = CameraRays(ray, pixel, medium=self._medium)
         walk = self._for_gradients.remembered(scene)
-        replay = FirstPass() if may_have_media(scene) else None
-        if mode != dr.ADMode.Primal:
-            replay = Replay(scene, state_in, δL if mode == dr.ADMode.Backward else None)
-        walk = replace(walk, replay=replay)
-        sample = walk(scene, sampler, rays, mi.Bool(active))
-        if mode == dr.ADMode.Forward:
-            return replay.derivative, sample.valid, [], None
-        return sample.L, sample.valid, [], sample.L
+        if mode == dr.ADMode.Primal:
+            first = FirstPass(self._fills_gaps) if may_have_media(scene) else None
+            sample = replace(walk, replay=first)(scene, sampler, rays, mi.Bool(active))
+            gathered = (sample.L, None)
+            if first is not None:
+                gathered = (first.L, first.detour_L if self._fills_gaps else None)
+            return sample.L, sample.valid, [], gathered
+        replay = Replay(scene, state_in[0], δL if mode == dr.ADMode.Backward else None, state_in[1])
+        sample = replace(walk, replay=replay)(scene, sampler, rays, mi.Bool(active))
+        L = sample.L if mode == dr.ADMode.Backward else replay.derivative
+        return L, sample.valid, [], None

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .media import grids
 from .parameter_values import values_of
 
 #: Parameters of shapes and sensors that change where rays hit.
@@ -38,6 +39,16 @@ def refuse_geometry(plugin: str, params: Any) -> None:
 def has_gradients(*things: mi.Object) -> bool:
     """Whether any parameter of a scene or a sensor has a gradient."""
     return any(dr.grad_enabled(value) for each in things for _, value in mi.traverse(each))
+
+
+def optimizes_grids(scene: mi.Scene) -> bool:
+    """Whether the extinction of a medium that is not homogeneous has a gradient. Media within
+    instances are not accessible."""
+    return any(
+        key.startswith("sigma_t") and dr.grad_enabled(value)
+        for medium in grids(scene)
+        for key, value in values_of(mi.traverse(medium))
+    )
 
 
 class Optimized:

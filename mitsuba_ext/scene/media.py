@@ -33,7 +33,13 @@ def has_instances(scene: mi.Scene) -> bool:
 
 def may_have_grids(scene: mi.Scene) -> bool:
     """Whether ``scene`` may have a medium that is not homogeneous."""
-    return has_instances(scene) or any(not medium.is_homogeneous() for medium in _media(scene))
+    return has_instances(scene) or any(True for _ in grids(scene))
+
+
+def grids(scene: mi.Scene) -> Iterator[mi.Medium]:
+    """The media of ``scene`` that are not homogeneous, outside instances. Each can occur several
+    times."""
+    return (medium for medium in _media(scene) if not medium.is_homogeneous())
 
 
 def has_homogeneous_media(scene: mi.Scene) -> bool:

@@ -221,7 +221,7 @@ class Media(NoMedia):
             )
             scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
-        return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
+        return vertex_at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
 
     def _rate(self, σ, inside):
         """The extinction ``σ`` with which the distance of a flight is sampled."""
@@ -349,7 +349,7 @@ def _context() -> mi.PhaseFunctionContext:
     return mi.PhaseFunctionContext(None)
 
 
-def _at(
+def vertex_at(
     si: mi.SurfaceInteraction3f, mei: mi.MediumInteraction3f, t: mi.Float, scatters: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     """The interaction of a vertex in a medium, where there is one; elsewhere ``si``."""

@@ -6,23 +6,72 @@ import drjit as dr
 import mitsuba as mi
 
 from .bsdfs import eval_bsdf
+from .detours import Detour, DetourPoint, detour_point
 from .free_flight import interaction_at
-from .media import eval_phase
-from .transmittance import Way
-from .vertex import MediumVertex, PathState, Vertex
+from .media import Inside, eval_phase
+from .transmittance import Way, stretch
+from .vertex import FlightEnd, PathState, Vertex
 
 
 # Not dataclasses: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
 class FirstPass:
     """The first of two passes along the same paths, in scenes with media: the walk draws the same
-    random numbers as in the second (:class:`Replay`)."""
+    random numbers as in the second (:class:`Replay`).
+
+    Parameters:
+        detours: Whether paths take detours (``detours.py``).
+
+    Attributes:
+        L: The radiance that each path has gathered, once they have ended.
+        detour_L: What they have gathered behind their detours.
+    """
+
+    def __init__(self, detours: bool = False) -> None:
+        self._detours = detours
+        self.L, self.detour_L = mi.Spectrum(0), mi.Spectrum(0)
+
+    def begin(self) -> Detour | None:
+        """The state before the first flight."""
+        if not self._detours:
+            return None
+        return Detour(mi.UInt32(0), mi.Bool(False), mi.Spectrum(0))
+
+    def end(self, detour: Detour | None, L: mi.Spectrum) -> None:
+        """The paths have ended, with ``L``."""
+        self.L = L if detour is None else dr.select(detour.taken, detour.L, L)
+        self.detour_L = L - self.L
 
     def flown(
-        self, ray: mi.Ray3f, medium: mi.MediumPtr, u: mi.Float, si: mi.SurfaceInteraction3f,
-        in_medium: MediumVertex, L: mi.Spectrum, active: mi.Bool,
-    ) -> None:  # fmt: skip
-        """The path has flown along ``ray`` through ``medium`` (or a vacuum) to the vertex ``si``.
-        It has gathered ``L`` so far. ``u`` is a random number."""
+        self, sampler: mi.Sampler, ray: mi.Ray3f, inside: Inside, start: FlightEnd,
+        end: FlightEnd, detour: Detour | None, L: mi.Spectrum, active: mi.Bool,
+    ) -> tuple[FlightEnd, Detour | None, mi.Bool]:  # fmt: skip
+        """A path has flown along ``ray``, and has gathered ``L`` before.
+
+        Parameters:
+            inside: The state of the path in media, during the flight.
+            start: The surface in the direction of the ray, with the throughput at its origin.
+            end: The vertex, with the throughput there.
+            detour: The state of detours.
+
+        Returns:
+            What a detour changes: the end, the state of detours, and which paths are active.
+        """
+        point, u = None, sampler.next_1d(active)
+        if detour is not None:
+            point, detour = detour_point(
+                sampler, ray, start.si.t, inside.medium, inside.channel, detour, active
+            )
+            detour.L = dr.select(point.chosen, L, detour.L)
+        active = self._flown(ray, inside.medium, u, end, point, L, active)
+        return end if point is None else point.end(start, end), detour, active
+
+    def _flown(
+        self, ray: mi.Ray3f, medium: mi.MediumPtr, u: mi.Float, end: FlightEnd,
+        point: DetourPoint | None, L: mi.Spectrum, active: mi.Bool,
+    ) -> mi.Bool:  # fmt: skip
+        """Propagates the derivatives of a flight. Returns which paths go on. ``u`` is a random
+        number."""
+        return active
 
     def emitted(
         self, si: mi.SurfaceInteraction3f, path: PathState, mis: mi.Float,
@@ -60,6 +109,7 @@ class Replay(FirstPass):
     Parameters:
         scene: The scene.
         L: The radiance that each path gathers.
+        detour_L: What it gathers behind its detour; ``None`` if there are none.
         δL: Backward: the derivative of the loss with respect to this radiance. ``None`` for forward
             mode.
 
@@ -67,8 +117,12 @@ class Replay(FirstPass):
         derivative: Forward: the derivative of the radiance of each path, once they have ended.
     """
 
-    def __init__(self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None) -> None:
-        self._scene, self._L, self._δL = scene, L, δL
+    def __init__(
+        self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None,
+        detour_L: mi.Spectrum | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(detour_L is not None)
+        self._scene, self._L, self._δL, self._detour_L = scene, L, δL, detour_L
         if δL is None:
             self._lane = dr.arange(mi.UInt32, dr.width(L))
             self._sums = dr.zeros(mi.Float, len(mi.Spectrum()) * dr.width(L))
@@ -78,17 +132,28 @@ class Replay(FirstPass):
     def derivative(self) -> mi.Spectrum:
         return dr.unravel(mi.Spectrum, self._sums)
 
-    def flown(self, ray, medium, u, si, in_medium, L, active):
-        later = self._L - L
-        active = active & (medium != None)  # noqa: E711
-        # Only where nothing attenuates the light is the distance infinite
-        length = dr.select(active & dr.isfinite(si.t), si.t, 0)
-        way = Way(interaction_at(ray, ray(u * length), medium), length)
-        scatters, mei = active & in_medium.scatters, in_medium.mei
+    def _flown(self, ray, medium, u, end, point, L, active):
+        in_media = active & (medium != None)  # noqa: E711
+        before, length = stretch(medium, ray, end.si.t, in_media)
+        way = Way(interaction_at(ray, ray(before + u * length), medium), length)
+        mei, scatters = end.in_medium.mei, in_media & end.in_medium.scatters
+        if point is not None:
+            in_media &= ~point.chosen
+            with dr.resume_grad():
+                σ_s, σ_t = _coefficients(point.mei, point.chosen)
+                share = point.rate / (dr.detach(σ_t) + point.rate)
+                self._propagate(dr.select(point.chosen, self._detour_L * share * σ_s, 0))
         with dr.resume_grad():
-            σ_s, _, _ = mei.medium.get_scattering_coefficients(mei, scatters)
-            weight = dr.select(scatters, dr.relative_grad(mi.Spectrum(σ_s)), 1)
-            self._propagate(dr.select(active, later * _attenuation(way) * weight, 0))
+            σ_s, σ_t = _coefficients(mei, scatters)
+            factor = dr.relative_grad(σ_s)
+            if point is not None:
+                σ_t = dr.detach(σ_t)
+                share = dr.select(σ_t > 0, σ_t / (σ_t + point.rate), 0)
+                factor = dr.replace_grad(mi.Spectrum(1), share * factor)
+            gained = (self._L - L) * _attenuation(way) * dr.select(scatters, factor, 1)
+            self._propagate(dr.select(in_media, gained, 0))
+        # What follows a detour has no derivatives
+        return active if point is None else active & ~point.chosen
 
     def emitted(self, si, path, mis, emitter, active):
         with dr.resume_grad():
@@ -133,5 +198,13 @@ class Replay(FirstPass):
 
 def _attenuation(way: Way) -> mi.Spectrum:
     """1, with the derivative of the attenuation on ``way`` relative to the attenuation itself."""
-    _, _, σ_t = way.mei.medium.get_scattering_coefficients(way.mei, way.length > 0)
-    return dr.replace_grad(mi.Spectrum(1), -way.length * mi.Spectrum(σ_t))
+    _, σ_t = _coefficients(way.mei, way.length > 0)
+    return dr.replace_grad(mi.Spectrum(1), -way.length * σ_t)
+
+
+def _coefficients(
+    mei: mi.MediumInteraction3f, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """σ_s and σ_t."""
+    σ_s, _, σ_t = mei.medium.get_scattering_coefficients(mei, active)
+    return mi.Spectrum(σ_s), mi.Spectrum(σ_t)

@@ -28,9 +28,23 @@ class Way:
     ) -> Way:
         """The way that goes on, where ``active``, along ``ray`` to ``end`` through ``medium``. The
         random number ``u`` decides whether its point lies there, and where."""
-        length = self.length + dr.select(active, end, 0)
-        mei = interaction_at(ray, ray(u * length), medium)
-        return Way(dr.select(active & (u * length < end), mei, self.mei), length)
+        start, added = stretch(medium, ray, end, active)
+        length = self.length + added
+        mei = interaction_at(ray, ray(start + u * length), medium)
+        return Way(dr.select(u * length < added, mei, self.mei), length)
+
+
+def stretch(
+    medium: mi.MediumPtr, ray: mi.Ray3f, end: mi.Float, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """Where ``ray`` enters the bounding box of ``medium``, and how far it then flies inside up to
+    the distance ``end``; 0 where not ``active``, or where nothing attenuates light up to an
+    infinite ``end``. Outside of its box, a grid has no extinction."""
+    meets, near, far = medium.intersect_aabb(ray)
+    start = dr.maximum(near, 0)
+    length = dr.minimum(far, end) - start
+    is_inside = active & meets & (length > 0) & dr.isfinite(length)
+    return dr.select(is_inside, start, 0), dr.select(is_inside, length, 0)
 
 
 @dr.syntax

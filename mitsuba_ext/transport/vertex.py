@@ -68,6 +68,20 @@ class MediumVertex:
 
 
 @dataclass
+class FlightEnd:
+    """The end of a flight: the vertex, and the throughput up to it.
+
+    Attributes:
+        si, β: The interaction at the vertex, and the throughput.
+        in_medium: The part of the vertex that concerns media.
+    """
+
+    si: mi.SurfaceInteraction3f
+    β: mi.Spectrum
+    in_medium: MediumVertex | None
+
+
+@dataclass
 class Vertex:
     """A point on a surface or in a medium that a path has reached.
 

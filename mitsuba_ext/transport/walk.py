@@ -39,7 +39,7 @@ from .path_decisions import (
 )
 from .path_program import PathProgram
 from .replay import FirstPass
-from .vertex import Arrival, PathState, Vertex
+from .vertex import Arrival, FlightEnd, PathState, Vertex
 
 
 @dataclass
@@ -142,6 +142,7 @@ class Walk:
         # In media, transmittance uses random numbers; `volpath` draws them before the BSDF's
         makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
         has_subpaths = self.program.subpaths is not None
+        replays_media = self.replay is not None and media.exist
 
         # --------------------- Configure the loop state ----------------------
         pixel = rays.pixel
@@ -166,6 +167,7 @@ class Walk:
         next_event_state = self.next_event.begin(sampler, ray, pixel)
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
+        detour = self.replay.begin() if replays_media else None
         self.observer.camera(rays)
 
         inside = media.begin(sampler, rays)
@@ -178,12 +180,16 @@ class Walk:
             si = self.query.interaction(pi, ray)
             if dr.hint(media.exist and has_subpaths, mode="scalar"):
                 L += self.program.subpaths.along(sampler, ray, si, inside, path, active)
+            if dr.hint(replays_media, mode="scalar"):
+                start = FlightEnd(si, path.β, None)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
             path.history = self.program.arrive(path, si)
 
-            if dr.hint(self.replay is not None and media.exist, mode="scalar"):
-                u = sampler.next_1d(active)
-                self.replay.flown(ray, inside.medium, u, si, in_medium, L, active)
+            if dr.hint(replays_media, mode="scalar"):
+                end, detour, active = self.replay.flown(
+                    sampler, ray, inside, start, FlightEnd(si, path.β, in_medium), detour, L, active
+                )
+                si, path.β, in_medium = end.si, end.β, end.in_medium
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
@@ -317,6 +323,8 @@ class Walk:
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
+        if replays_media:
+            self.replay.end(detour, L)
         return Sample(L, valid, scatter_count, shadow_count, connection_count), direct
 
     @property

@@ -1,0 +1,116 @@
+"""In-scattered light where a medium is empty, for derivatives with respect to its extinction.
+
+Where σ_t = 0, no path scatters, but a little more extinction would scatter light there: the
+derivative of the radiance along a ray is ∫ T(t) σ_s'(t) L_s(t) dt and the derivative of T, where
+L_s is the in-scattered radiance. Paths that scatter in proportion to σ_t never see L_s in empty
+regions, and rarely in thin ones. So some of the paths in media of varying density take a *detour*:
+instead of flying on, they scatter at a uniform point, with the transmittance up to there. What such
+a path gathers behind that point is L_s. It is not part of the path's radiance.
+
+Points at which a path scatters and points of detours are weighed with the balance heuristic. The
+density of the former is σ_t, of the latter ``rate``, both relative to the probability of a flight
+that far.
+
+Source: M. Nimier-David, T. Müller, A. Keller, W. Jakob, *Unbiased Inverse Volume Rendering with
+Differential Trackers*, ACM Transactions on Graphics 41(4), 2022, section 4 (which samples points in
+proportion to the transmittance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .free_flight import interaction_at
+from .media import vertex_at
+from .transmittance import ratio_tracking, stretch
+from .vertex import FlightEnd, MediumVertex
+
+
+@dataclass
+class Detour:
+    """The state of a path.
+
+    Attributes:
+        flights: The number of flights in media of varying density.
+        taken: Whether the path has taken its detour.
+        L: The radiance that it had gathered before.
+    """
+
+    flights: mi.UInt32
+    taken: mi.Bool
+    L: mi.Spectrum
+
+
+@dataclass
+class DetourPoint:
+    """Where a flight may scatter for derivatives only.
+
+    Attributes:
+        chosen: Whether it does.
+        mei: The interaction there.
+        t: Its distance.
+        weight: The transmittance up to the point, divided by its density.
+        kept: The weight of flights that take no detour.
+        rate: See above; 0 where there are no detours.
+    """
+
+    chosen: mi.Bool
+    mei: mi.MediumInteraction3f
+    t: mi.Float
+    weight: mi.Spectrum
+    kept: mi.Float
+    rate: mi.Float
+
+    def end(self, start: FlightEnd, end: FlightEnd) -> FlightEnd:
+        """The end of flights of which some are detours. ``end`` is their end without; ``start`` has
+        the throughput before."""
+        scatters = end.in_medium.scatters | self.chosen
+        mei = dr.select(self.chosen, self.mei, end.in_medium.mei)
+        return FlightEnd(
+            si=vertex_at(end.si, self.mei, self.t, self.chosen),
+            # Without the scattering coefficient
+            β=dr.select(self.chosen, start.β * self.weight, end.β * self.kept),
+            in_medium=MediumVertex(scatters, mei),
+        )
+
+
+def detour_point(
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    end: mi.Float,
+    medium: mi.MediumPtr,
+    channel: mi.UInt32,
+    detour: Detour,
+    active: mi.Bool,
+) -> tuple[DetourPoint, Detour]:
+    """Chooses the flights that become detours, and their points.
+
+    Parameters:
+        ray, end: The ray, and the distance of the surface that it hits.
+        medium, channel: The medium, and the colour that chooses distances.
+        detour: The state before the flight.
+
+    Returns:
+        The point, and the new state, except for the radiance.
+    """
+    flies = active & (medium != None) & ~medium.is_homogeneous()  # noqa: E711
+    start, length = stretch(medium, ray, end, flies)
+    flies &= (length > 0) & ~detour.taken
+    # Later flights carry less: a path keeps its flights with the probabilities 3/4, 4/5, 5/6, …
+    probability = dr.rcp(mi.Float(detour.flights + 4))
+    chosen = flies & (sampler.next_1d(flies) < probability)
+    t = start + sampler.next_1d(chosen) * length
+    T = ratio_tracking(ray, t, medium, channel, sampler, mi.Spectrum(1), chosen)
+    point = DetourPoint(
+        chosen=chosen,
+        mei=interaction_at(ray, ray(t), medium),
+        t=t,
+        weight=T * (length / probability),
+        kept=dr.select(flies, dr.rcp(1 - probability), 1),
+        rate=dr.select(flies, probability / ((1 - probability) * length), 0),
+    )
+    flights = detour.flights + dr.select(flies, mi.UInt32(1), 0)
+    return point, Detour(flights, detour.taken | chosen, detour.L)
