@@ -7,10 +7,11 @@ on is described (:class:`CallDescription`): the classes of our objects and the v
 attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
 used again only where all of this is the same.
 
-Nothing is recorded in three cases: in spectral variants, whose colour tables are not arguments of
-any function; with a ``batch`` of sensors, which loads a table of them whenever it is traced; and
-where kernels call plugins that are written in Python, which may read arrays or free memory of NumPy
-while they are traced. Dr.Jit ends the process in the last two cases. A function with an argument
+Nothing is recorded in four cases: in spectral variants, whose colour tables are not arguments of
+any function; with a ``batch`` of sensors, which loads a table of them whenever it is traced; where
+kernels call plugins that are written in Python, which may read arrays or free memory of NumPy while
+they are traced (Dr.Jit ends the process in these two cases); and once the grid of a volume has
+changed: Dr.Jit 1.5.0 may use the earlier grid in a recording, also in a new one. A function with an argument
 that cannot be described is not frozen either: a sampler in Python, or a ``thinlens`` or an
 ``orthographic`` sensor, which do not report all their arrays to Dr.Jit. (With these, camera rays
 are traced in each pass, and what follows is recorded.) The log says why (level ``Debug``). If
@@ -80,14 +81,17 @@ class _SceneRecordings:
         mark: Identifies the scene.
         held: Objects outside of the scene that descriptions name by their address.
         recordings: The recordings, by description.
+        grids: The data of volumes at the first render. While they are held, no others can get their
+            indices.
         refused: Functions that are not frozen.
-        cannot_be_recorded: Whether Dr.Jit has failed to record a function. Others would fail too,
-            when the render has already taken many samples.
+        cannot_be_recorded: Whether a grid has changed, or Dr.Jit has failed to record a function.
+            Others would fail too, when the render has already taken many samples.
     """
 
     mark: SceneMark
     held: dict[int, Any] = field(default_factory=dict)
     recordings: OrderedDict[Any, _Recording] = field(default_factory=OrderedDict)
+    grids: list[Any] | None = None
     refused: set[Any] = field(default_factory=set)
     cannot_be_recorded: bool = False
 
@@ -240,6 +244,16 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     if mark.array is None or mark.array.state != dr.VarState.Evaluated:
         return None
     kept = _kept(mark)
+    # Copies: the array of a tensor follows changes
+    grids = [
+        type(value.array)(value.array)
+        for node in nodes if isinstance(node, mi.Volume)
+        for _, value in values_of(mi.traverse(node)) if dr.is_tensor_v(value)
+    ]  # fmt: skip
+    kept.grids = grids if kept.grids is None else kept.grids
+    if [data.index for data in grids] != [data.index for data in kept.grids]:
+        kept.recordings.clear()
+        kept.cannot_be_recorded = True
     if kept.cannot_be_recorded:
         return None
     sensors = scene.sensors()
