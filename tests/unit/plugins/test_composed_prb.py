@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.util.errors import one_line
-from tests.support.fogs import fog
 from tests.support.stage import area, bitmap, diffuse, rectangle, rgb, stage
 from tests.support.statistical import load
 
@@ -280,8 +279,6 @@ def test_decisions_without_gradients_are_refused() -> None:
         dr.backward(dr.mean(image, axis=None))
     causes = [one_line(error.value), str(error.value.__cause__)]
     assert any("which changes geometry" in text for text in causes), causes
-    with pytest.raises(NotImplementedError, match='use "prbvolpath"'):
-        make().render(mi.load_dict(fog("area")), spp=1)
     for parameters, message in (
         ({"next_event": "resampled"}, 'no gradients with the "resampled_lights"'),
         ({"directions": "swarm"}, "no gradients"),
