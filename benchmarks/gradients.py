@@ -1,9 +1,13 @@
-"""How noisy are gradients, and how long do they take? ``composed_prb`` against Mitsuba's ``prb``.
+"""How noisy are gradients, and how long do they take? ``composed_prb`` against Mitsuba's ``prb``,
+or ``prbvolpath`` in scenes with media.
 
     python benchmarks/gradients.py scenes/rooms.xml --spp 64
+    python benchmarks/in_fog.py scenes/rooms.xml 0.05 --clear 0.1
+    python benchmarks/gradients.py scenes/rooms_in_fog.xml --spp 64
 
 The loss is the mean of the image, weighted by random numbers / (1 + radiance). Its gradients are
-those with respect to all colours, roughnesses and emissions of the scene that are no textures;
+those with respect to all colours, roughnesses and emissions of the scene that are no textures, and
+to the albedo and extinction of media;
 with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
 over the renders but the first two, of the image and its gradients, of all cores; learning included.
@@ -25,11 +29,15 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
-_ENDS = ("reflectance.value", "radiance.value", "alpha.value")
+from mitsuba_ext.scene.media import has_media  # isort: skip
 
-#: The first one is that to which the others are compared.
+_ENDS = ("reflectance.value", "radiance.value", "alpha.value", "albedo.value.value",
+         "sigma_t.value.value")  # fmt: skip
+
+#: The first one, in scenes with media the second, is that to which the others are compared.
 INTEGRATORS = {
     "prb": {"type": "prb"},
+    "prbvolpath": {"type": "prbvolpath"},
     "composed_prb": {"type": "composed_prb"},
     "lights": {"type": "composed_prb", "next_event": "contribution"},
     "guide and lights": {
@@ -59,7 +67,8 @@ def load(file: Path, size: tuple[int, int]) -> tuple[mi.Scene, mi.SceneParameter
     sensor["film.size"] = sensor["film.crop_size"] = list(size)
     sensor.update()
     random = np.random.default_rng(1).uniform(0.5, 1.5, (*size[::-1], 3))
-    mean = mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=64)
+    plugin = "composed_path" if has_media(scene) else "bdpt"
+    mean = mi.render(scene, integrator=mi.load_dict({"type": plugin, "max_depth": 6}), spp=64)
     weights = mi.TensorXf((random / (1 + np.array(mean))).astype(np.float32))
     return scene, mi.traverse(scene), weights
 
@@ -82,7 +91,10 @@ def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], l
             sets = all_lamps[:: -(-len(all_lamps) // lamps)]
         print(f"{file}, {spp} spp, {sum(map(len, sets))} parameters", flush=True)
         known = None
+        unused = "prb" if has_media(scene) else "prbvolpath"
         for first, (name, plugin) in enumerate(INTEGRATORS.items()):
+            if name == unused:
+                continue
             found, times = [[] for _ in sets], []
             for index, wanted in enumerate(sets):
                 integrator = mi.load_dict({**plugin, "max_depth": 6})

@@ -31,9 +31,9 @@ class ComposedPRB(common.RBIntegrator):
     Gradients of the composed path tracer (:monosp:`composed_prb`)
     --------------------------------------------------------------
 
-    Path replay backpropagation, as in Mitsuba's :monosp:`prb`, along the paths of
-    :class:`composed_path`. Lights and directions can be learned, which makes gradients less noisy
-    in scenes with many or hidden lights. For use with :monosp:`mi.render(scene, params,
+    Path replay backpropagation, as in Mitsuba's :monosp:`prb` and :monosp:`prbvolpath`, along the
+    paths of :class:`composed_path`. Lights and directions can be learned, which makes gradients
+    less noisy in scenes with many or hidden lights. For use with :monosp:`mi.render(scene, params,
     integrator=…)`.
 
     .. pluginparameters::
@@ -82,12 +82,14 @@ class ComposedPRB(common.RBIntegrator):
        - |float|
        - Seconds after which a render of the image (not of gradients) ends. (Default: -1, none)
 
-    **Use it when** you optimize materials, textures, lights or environment maps. **Not when** you
-    optimize the position or shape of objects, or the camera (use :monosp:`prb` or
-    :monosp:`prb_projective`), or a scene with participating media (use :monosp:`prbvolpath`): these
-    are refused, and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth
-    glass have no gradients, and gradients of exactly black colours lack the light that scattered
-    rays would have found.
+    **Use it when** you optimize materials, textures, lights, environment maps or participating
+    media: their albedo, their extinction (:monosp:`sigma_t`; Mitsuba's :monosp:`scale` has no
+    derivatives), and parameters of phase functions. **Not when** you optimize the position or shape
+    of objects, or the camera (use :monosp:`prb` or :monosp:`prb_projective`): these are refused,
+    and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth glass have no
+    gradients, nor has the opacity of masks where light passes. Gradients of exactly black colours,
+    of an albedo of 0, and of a homogeneous extinction of 0 lack the light that scattered rays would
+    have found.
 
     The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
@@ -95,13 +97,21 @@ class ComposedPRB(common.RBIntegrator):
     weights and learned maps are treated as constants. With all defaults, gradients are the same as
     with :monosp:`prb`, from the same random numbers up to :monosp:`rr_depth`.
 
+    In media, the camera may be in fog, and extinctions may be coloured. The extinction of a grid
+    has unbiased gradients where the grid is empty, too: some paths scatter there for derivatives
+    only, which find the light that a little more extinction would scatter. (:monosp:`prbvolpath`
+    finds only the light that it would absorb: in empty regions, its gradient may have the wrong
+    sign.) Grids within instances, which are not accessible, have no such paths.
+
     The first render of a scene takes pilot samples and learns; later renders, and the passes for
     gradients, use what it has learned. :monosp:`forget()` makes the next render learn again. If
     some of several lights are optimized, the passes for gradients learn which light is best for
     their derivatives.
 
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
-    Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021.
+    Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021; for
+    empty regions of grids: M. Nimier-David, T. Müller, A. Keller, W. Jakob, *Unbiased Inverse
+    Volume Rendering with Differential Trackers*, ACM Transactions on Graphics 41(4), 2022.
 
     .. tabs::
         .. code-tab:: xml
@@ -117,6 +127,9 @@ class ComposedPRB(common.RBIntegrator):
             'directions': 'guided',
             'next_event': 'contribution'
     """
+
+    #: For remarks about scenes, as in :class:`WalkIntegrator`.
+    sees_media = True
 
     # Bound here: a variant that is selected later replaces these names in the module
     _paths = RememberingPath, SensitivePath

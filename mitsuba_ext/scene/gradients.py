@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .media import grids
+from .media import scene_media
 from .parameter_values import values_of
 
 #: Parameters of shapes and sensors that change where rays hit.
@@ -46,32 +46,40 @@ def optimizes_grids(scene: mi.Scene) -> bool:
     instances are not accessible."""
     return any(
         key.startswith("sigma_t") and dr.grad_enabled(value)
-        for medium in grids(scene)
+        for medium in scene_media(scene)
+        if not medium.is_homogeneous()
         for key, value in values_of(mi.traverse(medium))
     )
 
 
 class Optimized:
-    """The BSDFs and lights of a scene that have parameters with gradients.
+    """The BSDFs, media and lights of a scene that have parameters with gradients.
 
     Attributes:
         lights_differ (bool): Whether some, but not all, of the lights are optimized.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        bsdfs, emitters = {}, {}
+        bsdfs, media, emitters = {}, {}, {}
         for shape in scene.shapes():
             index = _index(mi.BSDFPtr(shape.bsdf()))
             is_known = bsdfs.get(index, False)
             bsdfs[index] = is_known or _is_optimized(shape.bsdf()) or _has_optimized_colours(shape)
         for emitter in scene.emitters():
             emitters[_index(mi.EmitterPtr(emitter))] = _is_optimized(emitter)
+        for medium in scene_media(scene):
+            media[_index(mi.MediumPtr(medium))] = _is_optimized(medium)
         self.lights_differ = len({*emitters.values()}) == 2
         self._bsdfs, self._emitters = _table(bsdfs), _table(emitters)
+        self._media = _table(media)
 
     def bsdf(self, bsdf: mi.BSDFPtr) -> mi.Float:
         """1 where it is optimized, otherwise 0."""
         return _gathered(self._bsdfs, bsdf)
+
+    def medium(self, medium: mi.MediumPtr) -> mi.Float:
+        """1 where it is optimized, otherwise 0."""
+        return _gathered(self._media, medium)
 
     def emitter(self, emitter: mi.EmitterPtr) -> mi.Float:
         """1 where it is optimized, otherwise 0."""
@@ -89,7 +97,7 @@ def _has_optimized_colours(shape: mi.Shape) -> bool:
     return any("." not in key and dr.grad_enabled(value) for key, value in values)
 
 
-def _index(pointer: mi.BSDFPtr | mi.EmitterPtr) -> int:
+def _index(pointer: mi.BSDFPtr | mi.MediumPtr | mi.EmitterPtr) -> int:
     return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
 
 
@@ -100,7 +108,7 @@ def _table(flags: Mapping[int, bool]) -> mi.Float:
     return mi.Float(table)
 
 
-def _gathered(table: mi.Float, pointer: mi.BSDFPtr | mi.EmitterPtr) -> mi.Float:
+def _gathered(table: mi.Float, pointer: mi.BSDFPtr | mi.MediumPtr | mi.EmitterPtr) -> mi.Float:
     index = dr.reinterpret_array(mi.UInt32, pointer)
     is_known = index < len(table)
     return dr.select(is_known, dr.gather(mi.Float, table, index, is_known), 1)

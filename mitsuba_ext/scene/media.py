@@ -16,7 +16,7 @@ from .movers import all_shapes, movers
 def has_media(scene: mi.Scene) -> bool:
     """Whether any sensor or shape of ``scene`` borders on a medium. Media within instances cannot
     be found; only :func:`may_have_media` takes them into account."""
-    return any(True for _ in _media(scene))
+    return any(True for _ in scene_media(scene))
 
 
 def may_have_media(scene: mi.Scene) -> bool:
@@ -33,18 +33,12 @@ def has_instances(scene: mi.Scene) -> bool:
 
 def may_have_grids(scene: mi.Scene) -> bool:
     """Whether ``scene`` may have a medium that is not homogeneous."""
-    return has_instances(scene) or any(True for _ in grids(scene))
-
-
-def grids(scene: mi.Scene) -> Iterator[mi.Medium]:
-    """The media of ``scene`` that are not homogeneous, outside instances. Each can occur several
-    times."""
-    return (medium for medium in _media(scene) if not medium.is_homogeneous())
+    return has_instances(scene) or any(not m.is_homogeneous() for m in scene_media(scene))
 
 
 def has_homogeneous_media(scene: mi.Scene) -> bool:
     """Whether ``scene`` has a homogeneous medium outside instances."""
-    return any(medium.is_homogeneous() for medium in _media(scene))
+    return any(medium.is_homogeneous() for medium in scene_media(scene))
 
 
 def extinction_varies(scene: mi.Scene) -> bool:
@@ -107,8 +101,8 @@ def refuse_moving_grids(scene: mi.Scene, what: str) -> None:
         )
 
 
-def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
-    """The media of ``scene``. Each can occur several times."""
+def scene_media(scene: mi.Scene) -> Iterator[mi.Medium]:
+    """The media of ``scene``, outside instances. Each can occur several times."""
     for sensor in scene.sensors():
         if sensor.get_medium() is not None:
             yield sensor.get_medium()

@@ -11,8 +11,8 @@ Nothing is recorded in four cases: in spectral variants, whose colour tables are
 any function; with a ``batch`` of sensors, which loads a table of them whenever it is traced; where
 kernels call plugins that are written in Python, which may read arrays or free memory of NumPy while
 they are traced (Dr.Jit ends the process in these two cases); and once the grid of a volume has
-changed: Dr.Jit 1.5.0 may use the earlier grid in a recording, also in a new one. A function with an argument
-that cannot be described is not frozen either: a sampler in Python, or a ``thinlens`` or an
+changed: Dr.Jit 1.5.0 may use the earlier grid in a recording, also in a new one. A function with an
+argument that cannot be described is not frozen either: a sampler in Python, or a ``thinlens`` or an
 ``orthographic`` sensor, which do not report all their arrays to Dr.Jit. (With these, camera rays
 are traced in each pass, and what follows is recorded.) The log says why (level ``Debug``). If
 Dr.Jit cannot record a function, the render starts over, nothing more is recorded in that scene, and

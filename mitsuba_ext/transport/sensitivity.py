@@ -1,7 +1,8 @@
-"""Paths weighted by the number of optimized BSDFs and lights that they meet."""
+"""Paths weighted by the number of optimized BSDFs, media and lights that they meet."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from ..scene.gradients import Optimized
@@ -9,16 +10,16 @@ from .path_program import PathProgram
 
 
 class Sensitivity(PathProgram):
-    """Multiplies the light of a path by the number of its vertices whose BSDF is optimized, plus
-    one if the light is: about the derivative of the path's radiance with respect to the logarithm
-    of all optimized parameters. A walk with this program renders that derivative instead of the
-    radiance, and what observes the walk learns from it.
+    """Multiplies the light of a path by the number of its vertices whose BSDF or medium is
+    optimized, plus one if the light is: about the derivative of the path's radiance with respect to
+    the logarithm of all optimized parameters. A walk with this program renders that derivative
+    instead of the radiance, and what observes the walk learns from it.
 
     The derivative is exact for parameters to which the BSDF or the emission is proportional, such
-    as colours. The history is the number of optimized BSDFs before the vertex.
+    as colours. The history is the number of optimized BSDFs and media before the vertex.
 
     Parameters:
-        optimized: The BSDFs and lights that are optimized.
+        optimized: The BSDFs, media and lights that are optimized.
     """
 
     def __init__(self, optimized: Optimized) -> None:
@@ -38,5 +39,9 @@ class Sensitivity(PathProgram):
         return self._count(vertex) + self._optimized.emitter(ds.emitter)
 
     def _count(self, vertex) -> mi.Float:
-        """The number of optimized BSDFs up to ``vertex``."""
-        return vertex.path.history + self._optimized.bsdf(vertex.bsdf)
+        """The number of optimized BSDFs and media up to ``vertex``."""
+        here, in_medium = self._optimized.bsdf(vertex.bsdf), vertex.medium
+        if in_medium is not None:
+            of_medium = self._optimized.medium(in_medium.mei.medium)
+            here = dr.select(in_medium.scatters, of_medium, here)
+        return vertex.path.history + here

@@ -96,8 +96,8 @@ def test_gradients_agree_with_prbvolpath() -> None:
     scene["cloud"] = {**cube(cloud(density())), "to_world": place}
     scene["cloud"]["interior"]["sigma_t"]["to_world"] = place.translate([-1, -1, -1]).scale(2)
     loaded, parameters = load(scene)
-    keys = keys_of(parameters, ".albedo.value.value", ".sigma_t.value.value", ".sigma_t.data",
-                   ".g", "light.emitter.radiance.value", "floor.bsdf.reflectance.value")  # fmt: skip
+    ends = ".albedo.value.value", ".sigma_t.value.value", ".sigma_t.data", ".g"
+    keys = keys_of(parameters, *ends, "floor.bsdf.reflectance.value", "light.emitter.radiance.value")
     assert len(keys) == 7
     ours, theirs = (
         [backward(loaded, parameters, keys, make(name), 20 * first + seed, 96)
@@ -116,9 +116,10 @@ def test_in_a_white_furnace_extinction_has_no_gradient_where_a_grid_is_empty(
 ) -> None:
     """What scatters into a ray replaces what scatters out of it. A path that scatters in proportion
     to the extinction never finds the former: the derivative would be −2, the length of the way."""
+    view = lookat([0, 0, 9], [0, 0, 0], [0, 1, 0])
     scene = {
         "type": "scene",
-        "sensor": sensor(to_world=lookat([0, 0, 9], [0, 0, 0], [0, 1, 0]), fov=3.0, film=film(4, 4)),
+        "sensor": sensor(to_world=view, fov=3.0, film=film(4, 4)),
         "sky": {"type": "constant", "radiance": 1.0},
         "cloud": cube(cloud(density(share_of_empty), albedo=1.0)),
     }  # fmt: skip
