@@ -313,9 +313,9 @@ def composed_prb(
 ) -> dict[str, Any]:
     """Gradients of the composed path tracer (composed_prb).
 
-    Path replay backpropagation, as in Mitsuba's prb, along the paths of composed_path. Lights and
-    directions can be learned, which makes gradients less noisy in scenes with many or hidden
-    lights. For use with mi.render(scene, params, integrator=…).
+    Path replay backpropagation, as in Mitsuba's prb and prbvolpath, along the paths of
+    composed_path. Lights and directions can be learned, which makes gradients less noisy in scenes
+    with many or hidden lights. For use with mi.render(scene, params, integrator=…).
 
     Parameters:
         directions (string or decision): As in composed_path, except swarm. (Default: uniform)

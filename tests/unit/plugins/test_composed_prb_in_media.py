@@ -96,8 +96,10 @@ def test_gradients_agree_with_prbvolpath() -> None:
     scene["cloud"] = {**cube(cloud(density())), "to_world": place}
     scene["cloud"]["interior"]["sigma_t"]["to_world"] = place.translate([-1, -1, -1]).scale(2)
     loaded, parameters = load(scene)
-    ends = ".albedo.value.value", ".sigma_t.value.value", ".sigma_t.data", ".g"
-    keys = keys_of(parameters, *ends, "floor.bsdf.reflectance.value", "light.emitter.radiance.value")
+    keys = keys_of(
+        parameters, ".albedo.value.value", ".sigma_t.value.value", ".sigma_t.data", ".g",
+        "light.emitter.radiance.value", "floor.bsdf.reflectance.value",
+    )  # fmt: skip
     assert len(keys) == 7
     ours, theirs = (
         [backward(loaded, parameters, keys, make(name), 20 * first + seed, 96)
