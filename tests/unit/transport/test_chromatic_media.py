@@ -12,7 +12,7 @@ from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.path_decisions import ScatteringAlone
 from mitsuba_ext.transport.queries.scene import scene_query
 from mitsuba_ext.transport.walk import Walk
-from tests.support.fogs import camera, cube, fog, grid, homogeneous
+from tests.support.fogs import cube, fog, grid, homogeneous
 from tests.support.stage import rgb
 from tests.support.statistical import (
     REFERENCE_SEEDS,
