@@ -72,6 +72,26 @@ class PassesThrough(Distances):
     scatter = False
 
 
+def enters(vertex: Vertex, wo: mi.Vector3f) -> mi.Bool:
+    """Whether light from the local direction ``wo`` crosses a rough, clear boundary of a medium
+    (skin, wax). Such a boundary blurs what is behind it, and narrow lobes find few photons there: a
+    camera path crosses it as if it were smooth, and gathers light inside."""
+    flags = vertex.bsdf.flags()
+    is_rough = mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
+    is_rough &= ~mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission)
+    crosses = mi.Frame3f.cos_theta(vertex.si.wi) * mi.Frame3f.cos_theta(wo) < 0
+    return is_rough & crosses & vertex.si.is_medium_transition()
+
+
+class MergedOutside(MergedSubpaths):
+    """Adds the light of photons at surfaces, without the light on the other side of boundaries that
+    camera paths cross (:func:`enters`)."""
+
+    def _merged(self, vertex, other, active):
+        wo = vertex.si.to_local(other.si.to_world(other.si.wi))
+        return super()._merged(vertex, other, active & ~enters(vertex, wo))
+
+
 class MergedInMedia(MergedSubpaths):
     """Adds to camera paths the light that light paths bring near them in participating media.
 

@@ -28,7 +28,7 @@ from ..merging.merging import MergedSubpaths
 from ..merging.merging_radius import MergingRadius
 from ..merging.vertex_grid import VertexGrid
 from ..path_memory import bytes_of_photons
-from .medium_photons import MergedInMedia, PassesThrough
+from .medium_photons import MergedInMedia, MergedOutside, PassesThrough, enters
 
 
 class SpecularPaths(EndingProgram):
@@ -37,16 +37,32 @@ class SpecularPaths(EndingProgram):
 
     Parameters:
         subpaths: The photons; ``None`` if there are none.
+        enters_media: Whether a path goes on through rough boundaries of media (:func:`enters`),
+            where :class:`MergedOutside` merges only photons on the side of the camera. The history
+            says whether the path has crossed one.
     """
 
-    def __init__(self, subpaths: Subpaths | None) -> None:
-        self.subpaths = subpaths
+    def __init__(self, subpaths: Subpaths | None, enters_media: bool = False) -> None:
+        self.subpaths, self._enters_media = subpaths, enters_media
+
+    def begin(self, ray):
+        return mi.Bool(False) if self._enters_media else None
+
+    def leave(self, vertex, bs):
+        if not self._enters_media:
+            return None
+        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        crossed = enters(vertex, bs.wo)
+        return dr.select(passes, vertex.path.history, crossed)
 
     def emission(self, weights, scene, si, ds, path, pdf):
         return mi.Float(1)
 
     def survival(self, roulette, state, vertex, path, late, active):
-        return dr.select(path.arrival.is_delta, mi.Float(1), 0), state
+        goes_on = path.arrival.is_delta
+        if self._enters_media:
+            goes_on = goes_on | path.history
+        return dr.select(goes_on, mi.Float(1), 0), state
 
 
 @dataclass
@@ -102,7 +118,7 @@ class PhotonMapper:
             if self.ball is not None:
                 walk = replace(walk, distance=PassesThrough())
             merged = self._merged(scene, vertices, light.count)
-        walk = replace(walk, program=SpecularPaths(merged))
+        walk = replace(walk, program=SpecularPaths(merged, self.ball is not None))
         sample = walk(scene, sampler, rays, active)
         scatter_count = light.by_camera_path(scatter_count, lanes)
         whole = replace(sample, scatter_count=sample.scatter_count + scatter_count)
@@ -120,7 +136,8 @@ class PhotonMapper:
         kept = None if self.ball is None else vertices.is_on_surface
         grid = VertexGrid(vertices, radius, kept, group)
         heroes, max_depth = Heroes(scene), self.walk.max_depth
-        merged = MergedSubpaths(
+        kind = MergedSubpaths if self.ball is None else MergedOutside
+        merged = kind(
             vertices, grid, None, heroes, max_depth, paths, groups, None, self.observer,
             self.walk.channels,
         )  # fmt: skip
