@@ -78,34 +78,43 @@ def diffuse_share(
     ctx: mi.BSDFContext,
     si: mi.SurfaceInteraction3f,
     wo: mi.Vector3f,
+    whole: mi.Spectrum | None,
     undivided: mi.Float | None,
     active: mi.Bool | bool = True,
 ) -> mi.UnpolarizedSpectrum:
-    """The share of diffuse lobes in the BSDF's value, without delta lobes, for each colour; 0 where
-    the value is zero. It depends on nothing but the vertex and the two directions.
+    """The share of diffuse lobes in the BSDF's value, without delta lobes, for each colour. It
+    depends on nothing but the vertex and the two directions. A BSDF with lobes of one kind is not
+    evaluated: the share is 1 if they are diffuse, otherwise 0.
 
     Mitsuba's ``principled`` and ``principledthin`` do not evaluate their lobes separately. What is
     diffuse is then what a Lambertian surface of the same albedo would scatter, but at most the
     whole value.
 
     Parameters:
+        whole: The value of the BSDF, as :func:`eval_bsdf` returns it, or the product of weight and
+            density of a sample; ``None`` if it is not known.
         undivided: The weight of the diffuse lobes where the BSDF is one of these two, or contains
             one of them, elsewhere negative; ``None`` if it is negative everywhere.
     """
+    flags, diffuse = bsdf.flags(), int(mi.BSDFFlags.Diffuse)
+    is_diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+    mixes = is_diffuse & mi.has_flag(flags, mi.BSDFFlags.Glossy)
+    active = active & mixes
+    if whole is None:
+        whole = _finite_value(bsdf.eval(ctx, si, wo, active))
+    whole = mi.unpolarized_spectrum(whole)
     parts = mi.BSDFContext(ctx.mode, ctx.type_mask, ctx.component)
-    diffuse = int(mi.BSDFFlags.Diffuse)
     parts.type_mask = ctx.type_mask & ~(int(mi.BSDFFlags.All) & ~diffuse)
-    one = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, active)))
-    parts.type_mask = ctx.type_mask & ~diffuse
-    other = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, active)))
-    whole = one + other
+    divides = active if undivided is None else active & (undivided < 0)
+    one = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, divides)))
     if undivided is not None:
-        albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active))
+        albedo = mi.unpolarized_spectrum(
+            bsdf.eval_diffuse_reflectance(si, active & (undivided >= 0))
+        )
         lambertian = albedo * (undivided * dr.inv_pi * dr.abs(mi.Frame3f.cos_theta(wo)))
-        # Both evaluations above have returned the whole value
-        one = dr.select(undivided < 0, one, dr.minimum(lambertian, other))
-        whole = dr.select(undivided < 0, whole, other)
-    return dr.select(whole > 0, dr.clip(one / whole, 0, 1), 0)
+        one = dr.select(undivided < 0, one, lambertian)
+    share = dr.select(whole > 0, dr.clip(one / whole, 0, 1), 0)
+    return dr.select(mixes, share, dr.select(is_diffuse, mi.Float(1), 0))
 
 
 def _finite(number: mi.Float) -> mi.Float:

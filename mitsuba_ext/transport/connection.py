@@ -130,7 +130,7 @@ class Connector:
             The light that arrives if unoccluded, with its MIS weight; three masks: the connection
             was considered, a shadow ray was traced, it was unoccluded; the new state.
         """
-        si, ds = vertex.si, connection.ds
+        si, ds, local_value = vertex.si, connection.ds, bsdf_value
         bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
         mis = self._program.connection(
             self._weights, self._scene, vertex, ds, count * ds.pdf, pdf
@@ -159,7 +159,7 @@ class Connector:
         if self._replay is not None:
             self._replay.connected(vertex, ds, β * (mis * weight) * T, visible, way)
         if self._channels is not None:
-            self._channels.connected(vertex, ds, value, visible)
+            self._channels.connected(vertex, ds, local_value, value, visible)
         self._observer.connection(
             connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )

@@ -68,10 +68,13 @@ class Heroes:
     Parameters:
         scene: The scene.
         hero_weight: A factor of the throughput, besides 4, where only the hero is left.
+
+    Attributes:
+        are_needed: Whether something disperses light.
     """
 
     def __init__(self, scene: mi.Scene, hero_weight: mi.Float | float = 1.0) -> None:
-        self._is_needed = mi.is_spectral and disperses(scene.shapes())
+        self.are_needed = mi.is_spectral and disperses(scene.shapes())
         self._count = dr.size_v(mi.Spectrum)
         self._factor = self._count * hero_weight
 
@@ -85,7 +88,7 @@ class Heroes:
 
     def begin(self) -> mi.Bool | None:
         """The state before the first bounce."""
-        return mi.Bool(False) if self._is_needed else None
+        return mi.Bool(False) if self.are_needed else None
 
     def connect(
         self,
@@ -96,7 +99,7 @@ class Heroes:
         wo: mi.Vector3f,
     ) -> mi.Spectrum:
         """The value of a BSDF that multiplies the throughput for a connection."""
-        if not self._is_needed:
+        if not self.are_needed:
             return bsdf_value
         return self._collapse(bsdf_value, self._refracts(bsdf, si, wo), is_alone)
 
@@ -114,7 +117,7 @@ class Heroes:
             The weight that multiplies the throughput; the factor in it that compensates for the
             lost wavelengths, by which Russian roulette must divide; and the new state.
         """
-        if not self._is_needed:
+        if not self.are_needed:
             return bsdf_weight, 1.0, is_alone
         # Light that passes through an opacity mask is not refracted
         refracts = self._refracts(bsdf, si, bs.wo)
@@ -127,7 +130,7 @@ class Heroes:
         multiplies both throughputs. Each vertex is given as the state of its path, and
         ``bsdf_value``, ``bsdf``, ``si``, ``wo`` of :meth:`connect`."""
         value = one[1] * other[1]
-        if not self._is_needed:
+        if not self.are_needed:
             return value
         refracts = self._refracts(*one[2:]) | self._refracts(*other[2:])
         return self._joined(value, refracts, one[0], other[0])
@@ -142,7 +145,7 @@ class Heroes:
         wo: mi.Vector3f,
     ) -> mi.Spectrum:
         """Like :meth:`join`, for two paths that meet at one vertex."""
-        if not self._is_needed:
+        if not self.are_needed:
             return bsdf_value
         return self._joined(bsdf_value, self._refracts(bsdf, si, wo), is_alone, other_is_alone)
 

@@ -26,7 +26,9 @@ them the image, are the same as without expressions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -82,14 +84,18 @@ class PathChannels:
         self._cells = max(1, len(cells))
         self._accepts = from_numpy(mi.UInt32, _masks(automaton.cells, len(expressions)))
         self._reads = len(automaton.next) > 1
-        classes = range(0, self._symbols, PER_CLASS)
-        self._sees_lobes = any(
-            automaton.tells_apart(first + side + _DIFFUSE, first + side + _GLOSSY)
-            for first in classes for side in (0, _KINDS)
-        )  # fmt: skip
+        lobes = [
+            (first + side + _DIFFUSE, first + side + _GLOSSY)
+            for first in range(0, self._symbols, PER_CLASS) for side in (0, _KINDS)
+        ]  # fmt: skip
+        self._sees_lobes = any(automaton.tells_apart(*symbols) for symbols in lobes)
         self._mixes = self._sees_lobes and mixes_lobes(scene)
+        # The states in which it matters whether the next event is diffuse; `None` if all are
+        divides = np.any([automaton.where_apart(*symbols) for symbols in lobes], axis=0)
+        self._divides = None if divides.all() else from_numpy(mi.Bool, divides)
         self._undivided = undivided_bsdfs(scene) if self._mixes else None
-        self._ctx = Heroes(scene).context()
+        heroes = Heroes(scene)
+        self._ctx, self._disperses = heroes.context(), heroes.are_needed
         self._lane, self._sums = mi.UInt32(0), _Sums(1)
 
     @property
@@ -102,7 +108,8 @@ class PathChannels:
         return (
             self._names, self._surface_class, self._symbols, self._lights, self._next, self._ends,
             self._of, self._cells, self._reads, self._sees_lobes, self._mixes, self._undivided,
-            self._begins, self._back, self._pairs, self._backs, self._accepts,
+            self._begins, self._back, self._pairs, self._backs, self._accepts, self._disperses,
+            self._divides,
         )  # fmt: skip
 
     # ---- Along a path ----
@@ -123,31 +130,47 @@ class PathChannels:
         self, path: PathState, emitter: mi.EmitterPtr, value: mi.Spectrum, active: mi.Bool
     ) -> None:
         """The path has hit a light, and gains ``value``."""
-        self._end(path.events, emitter, value, active)
+        self._add(self._ended(path.events, _looked_up(self._names, emitter)), value, active)
 
     def connected(
-        self, vertex: Vertex, ds: mi.DirectionSample3f, value: mi.Spectrum, active: mi.Bool
+        self,
+        vertex: Vertex,
+        ds: mi.DirectionSample3f,
+        bsdf_value: mi.Spectrum,
+        value: mi.Spectrum,
+        active: mi.Bool,
     ) -> None:
-        """``vertex`` was connected to a light, and the path gains ``value``."""
+        """``vertex`` was connected to a light, towards which the BSDF has the value ``bsdf_value``,
+        and the path gains ``value``."""
         wo = vertex.si.to_local(ds.d)
-        for kind, share in self._parts(vertex, wo, active):
-            states = self._behind(vertex, [self._symbol(vertex, wo, kind)])
-            self._end(states, ds.emitter, value * share, active)
+        light = _looked_up(self._names, ds.emitter)
+        self._gain(vertex, wo, bsdf_value, value, active, lambda s: self._ended(s, light))
 
-    def left(self, vertex: Vertex, bs: mi.BSDFSample3f) -> list[mi.UInt32]:
-        """The state behind ``vertex``, in the direction ``bs`` that was sampled there."""
+    def left(
+        self, vertex: Vertex, bs: mi.BSDFSample3f, weight: mi.Spectrum, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The state behind ``vertex``, in the direction ``bs`` that was sampled there. ``weight``
+        is the BSDF's value in this direction / density."""
         if not self._reads:
             return vertex.path.events
-        return self._behind(vertex, self._sampled(vertex, bs, bs.wo))
+        if self._divides is not None:
+            states = vertex.path.events
+            active = active & _any(dr.gather(mi.Bool, self._divides, s, active) for s in states)
+        return self._behind(vertex, self._sampled(vertex, bs, bs.wo, weight * bs.pdf, active))
 
     def _sampled(
-        self, vertex: Vertex, bs: mi.BSDFSample3f, wo: mi.Vector3f
+        self,
+        vertex: Vertex,
+        bs: mi.BSDFSample3f,
+        wo: mi.Vector3f,
+        whole: mi.Spectrum | None,
+        active: mi.Bool,
     ) -> list[mi.UInt32]:
         """The symbol that each colour reads at a vertex, for the lobe that ``bs`` is from."""
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         symbols = []
-        for kind in self._chosen(vertex, wo, ~is_delta):
+        for kind in self._chosen(vertex, wo, whole, active & ~is_delta):
             kind = dr.select(is_delta, mi.UInt32(_SPECULAR), kind)
             symbol = self._symbol(vertex, wo, kind)
             symbols.append(dr.select(is_straight, mi.UInt32(STRAIGHT), symbol))
@@ -172,12 +195,15 @@ class PathChannels:
         state = dr.gather(mi.UInt32, self._begins, _looked_up(self._names, emitter))
         return [mi.UInt32(state) for _ in range(self.colours)]
 
-    def left_by_light(self, vertex: Vertex, bs: mi.BSDFSample3f) -> list[mi.UInt32]:
+    def left_by_light(
+        self, vertex: Vertex, bs: mi.BSDFSample3f, active: mi.Bool
+    ) -> list[mi.UInt32]:
         """The state of a light path behind ``vertex``, in the direction ``bs`` that was sampled
         there."""
         if self._backs == 1:
             return vertex.path.events
-        return self._before(vertex, self._sampled(_reversed(vertex, bs.wo), bs, vertex.si.wi))
+        symbols = self._sampled(_reversed(vertex, bs.wo), bs, vertex.si.wi, None, active)
+        return self._before(vertex, symbols)
 
     def past(
         self, vertex: Any, to_camera: mi.Vector3f, active: mi.Bool
@@ -189,22 +215,22 @@ class PathChannels:
         if self._backs == 1:
             return vertex.events
         reverse, wo = _reversed(at, to_camera), vertex.si.wi
-        kinds = self._chosen(reverse, wo, active)
+        kinds = self._chosen(reverse, wo, None, active)
         return self._before(at, [self._symbol(reverse, wo, kind) for kind in kinds])
 
     def joined(
         self,
         vertex: Vertex,
         wo: mi.Vector3f,
+        bsdf_value: mi.Spectrum,
         others: list[mi.UInt32],
         value: mi.Spectrum,
         active: mi.Bool,
     ) -> None:
         """The path gains ``value`` from light paths with the states ``others``, whose light arrives
-        at ``vertex`` from the local direction ``wo``."""
-        for kind, share in self._parts(vertex, wo, active):
-            states = self._behind(vertex, [self._symbol(vertex, wo, kind)])
-            self._add(self._met(states, others), value * share, active)
+        at ``vertex`` from the local direction ``wo``. The BSDF has the value ``bsdf_value``
+        there."""
+        self._gain(vertex, wo, bsdf_value, value, active, lambda s: self._met(s, others))
 
     def joined_in_medium(
         self, path: PathState, others: list[mi.UInt32], value: mi.Spectrum, active: mi.Bool
@@ -235,20 +261,47 @@ class PathChannels:
 
     # ---- Symbols ----
 
-    def _parts(self, vertex: Vertex, wo: mi.Vector3f, active) -> list[tuple[Any, Any]]:
-        """Into which kinds of lobes a connection is divided, and the share of each."""
+    def _gain(
+        self,
+        vertex: Vertex,
+        wo: mi.Vector3f,
+        whole: mi.Spectrum,
+        value: mi.Spectrum,
+        active: mi.Bool,
+        cells_of: Callable[[list[mi.UInt32]], list[mi.UInt32]],
+    ) -> None:
+        """Divides the ``value`` of a connection among the kinds of lobes, whose sum is ``whole``.
+        ``cells_of`` finds the cells of the states behind the vertex."""
         if not self._mixes:
-            return [(self._kind(vertex.bsdf), 1.0)]
-        share = diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, self._weight(vertex), active)
-        return [(mi.UInt32(_DIFFUSE), share), (mi.UInt32(_GLOSSY), 1 - share)]
+            symbol = self._symbol(vertex, wo, self._kind(vertex.bsdf))
+            self._add(cells_of(self._behind(vertex, [symbol])), value, active)
+            return
+        diffuse, glossy = (
+            cells_of(self._behind(vertex, [self._symbol(vertex, wo, mi.UInt32(kind))]))
+            for kind in (_DIFFUSE, _GLOSSY)
+        )
+        # Where both belong to the same channels, no lobe is evaluated
+        divides = active & _any(one != other for one, other in zip(diffuse, glossy))
+        share = self._diffuse_share(vertex, wo, whole, divides)
+        share = dr.select(divides, share, 1)
+        self._add(diffuse, value * share, active)
+        self._add(glossy, value * (1 - share), divides)
 
-    def _chosen(self, vertex: Vertex, wo: mi.Vector3f, active) -> list[mi.UInt32]:
+    def _chosen(
+        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active
+    ) -> list[mi.UInt32]:
         """The kind of lobe that each colour of a path takes for a sampled direction."""
         if not self._mixes:
             return [self._kind(vertex.bsdf)]
-        share = diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, self._weight(vertex), active)
+        share = self._diffuse_share(vertex, wo, whole, active)
         number = _hashed(vertex.si.p, wo)
         return [dr.select(number < part, mi.UInt32(_DIFFUSE), _GLOSSY) for part in share]
+
+    def _diffuse_share(self, vertex: Vertex, wo: mi.Vector3f, whole, active):
+        # Where light disperses, values are of the hero alone
+        whole = None if self._disperses else whole
+        weight = self._weight(vertex)
+        return diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, whole, weight, active)
 
     def _kind(self, bsdf: mi.BSDFPtr) -> mi.UInt32:
         """The kind of the smooth lobes of BSDFs that have only one."""
@@ -306,11 +359,9 @@ class PathChannels:
             for state, other in zip(states, others)
         ]
 
-    def _end(self, states: list[mi.UInt32], emitter, value: mi.Spectrum, active) -> None:
-        """Adds the light of a path that ends at ``emitter``."""
-        light = _looked_up(self._names, emitter)
-        cells = [dr.gather(mi.UInt32, self._ends, s * self._lights + light) for s in states]
-        self._add(cells, value, active)
+    def _ended(self, states: list[mi.UInt32], light: mi.UInt32) -> list[mi.UInt32]:
+        """The cells of paths that end at a light."""
+        return [dr.gather(mi.UInt32, self._ends, s * self._lights + light) for s in states]
 
     def _add(self, cells: list[mi.UInt32], value: mi.Spectrum, active) -> None:
         """Adds a value to cells: to one, or each colour to its own."""
@@ -344,8 +395,13 @@ class _Sums:
         """The memory of a sum."""
         return 4 if len(mi.Spectrum()) == 1 else 16
 
+    @dr.syntax
     def add(self, index: mi.UInt32, words: list[mi.Float], active: mi.Bool) -> None:
-        """Adds a spectrum."""
+        """Adds a spectrum. Where no lane of a vector unit does, nothing is read or written."""
+        if active:
+            self._add(index, words, active)
+
+    def _add(self, index: mi.UInt32, words: list[mi.Float], active: mi.Bool) -> None:
         if self._packet == 1:
             add_own(self._words, words[0], index, active)
             return
@@ -368,6 +424,10 @@ def colour_names() -> str:
 def film_colours(value: mi.Spectrum, wavelengths: mi.Spectrum | None) -> list[mi.Float]:
     """The values of these colours."""
     return list(to_rgb(value, wavelengths))[: len(colour_names())]
+
+
+def _any(masks: Iterable[mi.Bool]) -> mi.Bool:
+    return functools.reduce(operator.or_, masks)
 
 
 def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:

@@ -250,12 +250,12 @@ class Walk:
             sample_1, sample_2, directions_weight, directions_state = self.directions.draw(
                 directions_state, sampler, vertex, turns
             )
-            bsdf_value, light_pdf, bs, bsdf_weight, scattering_state = self.scattering.sample(
+            bsdf_value, light_pdf, bs, sample_weight, scattering_state = self.scattering.sample(
                 scattering_state, ctx, vertex, wo, sample_1, sample_2
             )
             bsdf_value = heroes.connect(path.hero_is_alone, bsdf_value, vertex.bsdf, si, wo)
             bsdf_weight, hero_count, hero_is_alone = heroes.scatter(
-                path.hero_is_alone, bsdf_weight, vertex.bsdf, si, bs
+                path.hero_is_alone, sample_weight, vertex.bsdf, si, bs
             )
 
             # ----- Does the light reach this vertex? -----
@@ -293,7 +293,8 @@ class Walk:
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
                 history=history,
-                events=None if self.channels is None else self.channels.left(vertex, bs),
+                events=self.channels
+                and self.channels.left(vertex, bs, sample_weight, active_next),
             )
             path = media.leave(vertex, bs, onward)
             active_next = media.is_within(path.depth, self.max_depth, active_next)

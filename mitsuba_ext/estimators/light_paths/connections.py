@@ -162,8 +162,8 @@ class LightSubpaths(Subpaths):
         active &= self._sums.is_open(far, back)
 
         # ----- Throughput of the connection -----
-        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
-        value = si.to_world_mueller(value, -wo, si.wi)
+        near_value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
+        value = si.to_world_mueller(near_value, -wo, si.wi)
         far_bsdf = far.bsdf()
         far_value, far_reverse = adjoint_value(self._ctx, far_bsdf, far, back, active)
         value = self._heroes.join(
@@ -190,7 +190,7 @@ class LightSubpaths(Subpaths):
         value = dr.select(visible, value, 0)
         if self._channels is not None:
             others = self._channels.past(other, back, visible)
-            self._channels.joined(vertex, wo, others, value, visible)
+            self._channels.joined(vertex, wo, near_value, others, value, visible)
         if self._techniques is not None:
             competing = None
             if self._sums.splits:

@@ -273,7 +273,7 @@ class LightWalk:
                 heroes, vertex, bs, weight, history, stores, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
-            events = self.channels and self.channels.left_by_light(vertex, bs)
+            events = self.channels and self.channels.left_by_light(vertex, bs, active_next)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 

@@ -180,6 +180,10 @@ class Automaton:
             bool((table[:, one] != table[:, other]).any()) for table in (self.next, self.back)
         )
 
+    def where_apart(self, one: int, other: int) -> np.ndarray:
+        """The forward states in which it matters which of two symbols comes next."""
+        return self.next[:, one] != self.next[:, other]
+
     @property
     def has_states(self) -> bool:
         """Whether it matters at all what happens at vertices."""

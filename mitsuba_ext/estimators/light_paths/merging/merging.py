@@ -270,8 +270,8 @@ class MergedSubpaths(Subpaths):
         active &= height < _HALF_HEIGHT * self._grid.radius
         active &= dr.dot(si.n, far.n) > _LEAST_COSINE
         wo = si.to_local(far.to_world(far.wi))
-        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
-        value = si.to_world_mueller(value, -wo, si.wi)
+        bsdf_value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
+        value = si.to_world_mueller(bsdf_value, -wo, si.wi)
         value = self._heroes.merge(
             vertex.path.hero_is_alone, other.hero_is_alone, value, vertex.bsdf, si, wo
         )
@@ -290,7 +290,7 @@ class MergedSubpaths(Subpaths):
         active &= dr.all(dr.isfinite(value))
         if self._channels is not None:
             brought = value * vertex.path.β * self._per_vertex
-            self._channels.joined(vertex, wo, other.events, brought, active)
+            self._channels.joined(vertex, wo, bsdf_value, other.events, brought, active)
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:
