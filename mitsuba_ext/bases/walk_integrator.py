@@ -36,12 +36,10 @@ from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
 from ..util.errors import InputError
 from ..util.stored_arrays import StoredArrays
+from .clamps import bias_by, clamped, read_clamps, refuse_expressions
 from .output_variables import OutputVariables
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
-
-#: The parameters that clamp the light of a sample.
-_CLAMPS = ("clamp_direct", "clamp_indirect")
 
 #: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
 _LEAST_SPP = 4
@@ -104,7 +102,7 @@ class WalkIntegrator(StagedIntegrator):
         max_depth = read("max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
         self.max_depth = max_depth if max_depth >= 0 else NO_LIMIT
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
-        self.clamps = self._read_clamps(props, read)
+        self.clamps = read_clamps(self.name, props, read, self.can_clamp)
         self.aovs = read("aovs", "")
         self.outputs = self._read_outputs()
         self.slots: dict[str, Technique] = {}
@@ -264,8 +262,7 @@ class WalkIntegrator(StagedIntegrator):
     @property
     def bias(self) -> str:
         """How the image is biased by parameters that trade bias for noise; empty if it is not."""
-        limits = [f"{key} = {limit:g}" for key, limit in self.clamps.items() if limit > 0]
-        return f"light is clamped ({', '.join(limits)})" if limits else ""
+        return bias_by(self.clamps)
 
     def _report_clamps(self, statistics: RenderStatistics) -> None:
         statistics.add_learned(f"{self.bias}; the image is biased")
@@ -410,7 +407,7 @@ class WalkIntegrator(StagedIntegrator):
             "max_depth": -1 if self.max_depth == NO_LIMIT else self.max_depth,
             "rr_depth": self.rr_depth,
             "hide_emitters": self.hide_emitters,
-            **{key: limit for key, limit in self.clamps.items() if limit > 0},
+            **clamped(self.clamps),
             **super().common_parameters(),
             "aovs": self.aovs or "none",
         }
@@ -424,24 +421,9 @@ class WalkIntegrator(StagedIntegrator):
                 f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
                 f"render, because {self.no_expressions}"
             )
-        for key, value in self.clamps.items():
-            if outputs.has_expressions and value > 0:
-                raise ValueError(
-                    f'"{self.name}": the parameter "{key}" is {value:g}, but "aovs" has light path '
-                    f"expressions, whose light is not clamped and would not add up to the image: "
-                    f"leave one of them out"
-                )
+        if outputs.has_expressions:
+            refuse_expressions(self.name, self.clamps)
         return outputs
-
-    def _read_clamps(self, props: mi.Properties, read: ParameterReader) -> dict[str, float]:
-        if self.can_clamp:
-            return {key: read(key, 0.0, minimum=0) for key in _CLAMPS}
-        for key in (key for key in _CLAMPS if key in props):
-            raise ValueError(
-                f'"{self.name}" has no parameter "{key}": only "composed_path", "auto_path" and '
-                f"others that trace nothing but camera paths clamp light"
-            )
-        return {}
 
     def _described_slots(self) -> dict[str, str]:
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
