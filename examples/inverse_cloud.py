@@ -1,11 +1,11 @@
-"""Recovers a cloud from three pictures of it: the extinction and the colour in each voxel of a
-grid that begins empty.
+"""Recovers a cloud from three pictures of it: the extinction and the albedo in each voxel of a grid
+that begins empty.
 
     python examples/inverse_cloud.py
 
 ``composed_prb`` computes the gradients; for comparison, Mitsuba's ``prbvolpath`` then takes as many
-steps. Prints the error at the end, and writes pictures of both from another side,
-``inverse_cloud.png``.
+steps. Prints the error at the end, and writes ``inverse_cloud.png``: the true cloud and the two
+recovered ones, from another side.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def recover(name: str, steps: int, targets: list[mi.TensorXf]) -> tuple[mi.Tenso
     return images[3], error
 
 
-def main(steps: int = 150) -> None:
+def main(steps: int = 60) -> None:
     truth = scene(*true_cloud())
     path = mi.load_dict({"type": "composed_path", "max_depth": MAX_DEPTH})
     targets = [mi.render(truth, integrator=path, sensor=n, spp=1024) for n in range(4)]
