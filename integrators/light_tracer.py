@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
-from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable, connectable_sensor
 from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
@@ -129,14 +129,14 @@ class LightTracerIntegrator(WalkIntegrator):
             raise NotImplementedError(
                 f'"{self.name}": nothing can be connected to the sensor '
                 f'"{sensor_at_rest(sensor).class_name()}": '
-                f'use a "perspective" or "thinlens", or the integrator "path"'
+                f'use a "perspective", "thinlens" or "orthographic", or the integrator "path"'
             )
         try:
             check_takes_splats(sensor.film())
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         query = self.query(scene)
-        target, walk = ConnectableSensor(sensor), None
+        target, walk = connectable(sensor), None
         if scene.emitters() and self.max_depth > 1:
             refuse_clear_curves(scene, f'"{self.name}"')
             self._warn_of_hidden(scene)

@@ -46,8 +46,10 @@ def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTa
         return None
     refuse_clear_curves(scene, f'"{integrator.name}"')
     side = LightSide.of(integrator.name, scene, sensor)
+    # The densities of chains of paths are per solid angle at the sensor
+    connectable = None if side.sensor is None or side.sensor.is_parallel else side.sensor
     space = PathSpace(
-        scene, sensor, side.emission, side.sensor, integrator.query(scene), setting.spp,
+        scene, sensor, side.emission, connectable, integrator.query(scene), setting.spp,
         least, most, integrator.hide_emitters,
     )  # fmt: skip
     return PathTarget(Mutations(space, switches))

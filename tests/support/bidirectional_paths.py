@@ -14,6 +14,7 @@ from mitsuba_ext.estimators.light_paths.bidirectional_programs import (
 )
 from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
+from mitsuba_ext.estimators.light_paths.lens import connectable
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, weight
 from mitsuba_ext.estimators.light_paths.scattering import (
     cosine_of_delta,
@@ -87,7 +88,7 @@ def trace(
     first.t = dr.select(emitted.is_infinite, first.t, dr.norm(first.p - emitted.start.p))
     last = from_light[-1][0]
     if camera == 0:
-        connection, _ = ConnectableSensor(sensor).connect(last, numbers.next_2d(), active)
+        connection, _ = connectable(sensor).connect(last, numbers.next_2d(), active)
         seen = mi.SurfaceInteraction3f(last)
         ds = dr.zeros(mi.DirectionSample3f, lanes)
         ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
@@ -296,7 +297,8 @@ def weights_of_techniques(
         last = vertices[-1]
         origin, pdf = sensor.origin(paths.camera_ray)
         wo = last.from_camera.wi
-        density = pdf / dr.squared_norm(last.p - origin) * geometric_cosine(last.from_light, wo)
+        spread = 1 if sensor.is_parallel else dr.squared_norm(last.p - origin)
+        density = pdf / spread * geometric_cosine(last.from_light, wo)
         reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
         seen = weight(sums.others(density, by_light[-1], reverse) / sums.image_count)
         found.append(dr.select(last.is_delta, 0, seen))

@@ -63,9 +63,10 @@ class BidirectionalProgram(PathProgram):
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
         is_first = path.depth == 0
         ref = dr.select(is_first, self._origin, path.arrival.ref.p)
-        later = self.sums.arrive(
-            path.history, si, dr.squared_norm(si.p - ref), is_first, by_light=False
-        )
+        squared = dr.squared_norm(si.p - ref)
+        if self._sensor is not None and self._sensor.is_parallel:
+            squared = dr.select(is_first, 1, squared)
+        later = self.sums.arrive(path.history, si, squared, is_first, by_light=False)
         # A ray that hits nothing keeps its density per solid angle
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.history.dVCM),

@@ -11,6 +11,7 @@ from ...transport.light_table import sampling_weights
 from ...transport.path_decisions import EmitterSampling
 from .both_ends import FromBothEnds
 from .emission import LightEmission
+from .lens import connectable
 from .sensor import ConnectableSensor
 
 
@@ -58,7 +59,7 @@ class LightSide:
             NotImplementedError: A light cannot emit light paths.
         """
         emission = light_emission(plugin, scene)
-        target = ConnectableSensor(sensor) if has_image and _can_connect(sensor) else None
+        target = connectable(sensor) if has_image and _can_connect(sensor) else None
         correct = sampling_weights(scene) if emission.has_smooth_meshes else None
         return cls(emission, target, correct)
 

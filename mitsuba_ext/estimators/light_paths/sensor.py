@@ -12,7 +12,7 @@ from ...scene.movers import is_moving_camera, point_at_rest, sensor_at_rest, vie
 from ...transport.path_decisions import SceneQuery
 
 #: The sensors of Mitsuba to which a point can be connected.
-_CONNECTABLE = ("PerspectiveCamera", "ThinLensCamera")
+_CONNECTABLE = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 
 
 @dataclass
@@ -24,9 +24,9 @@ class SensorConnection:
         target: End of the shadow ray: the point of this line on the near clip plane, where camera
             rays begin.
         position: Position on the film: pixels in the crop window, plus the window's offset.
-        pdf: Density with which the sensor, from this point of the aperture, would send a camera
-            ray here, per solid angle; it integrates to 1 over the crop window.
-        importance: ``pdf`` / ``dist``², the factor of flux per solid angle.
+        importance: Density with which the sensor, from this point of the aperture, would send a
+            camera ray here, per area across the ray; it integrates to 1 over the crop window. It
+            is the factor of flux per solid angle.
         active: Points that are seen unless they are occluded.
     """
 
@@ -34,7 +34,6 @@ class SensorConnection:
     dist: mi.Float
     target: mi.Point3f
     position: mi.Point2f
-    pdf: mi.Float
     importance: mi.Float
     active: mi.Bool
 
@@ -52,7 +51,7 @@ class UniformLens:
 
 
 class ConnectableSensor:
-    """A sensor to which points of the scene can be connected.
+    """A ``perspective`` or ``thinlens``, to which points of the scene can be connected.
 
     Mitsuba's ``sample_direction`` is used for positions only. Its importance is 0 on a part of the
     film of a ``perspective`` with a shifted principal point, and it returns points behind a
@@ -61,25 +60,37 @@ class ConnectableSensor:
     Parameters:
         sensor: A sensor for which :meth:`can_connect` is true.
         lens: Chooses the points of the aperture.
+
+    Attributes:
+        is_parallel: Whether all camera rays have the same direction. The density of a camera ray
+            does not depend on the distance then.
     """
 
+    is_parallel = False
+
     def __init__(self, sensor: mi.Sensor, lens: UniformLens | None = None) -> None:
-        self._sensor, self._lens = sensor, lens or UniformLens()
+        self._lens = lens or UniformLens()
+        parameters = self._read(sensor)
         film = sensor.film()
         width, height = (int(n) for n in film.size())
         crop_width, crop_height = (int(n) for n in film.crop_size())
-        # By parameters, not by methods of the class: Mitsuba's integrators that nest ours pass the
-        # sensor as a plain ``mi.Sensor``
-        parameters = mi.traverse(sensor)
         angle = float(dr.slice(parameters["x_fov"]))
         crop = crop_width * crop_height / (width * height)
         #: Area of the crop window's image at the distance 1
         area = (2 * math.tan(math.radians(angle) / 2)) ** 2 * height / width * crop
         self._inverse_area = dr.opaque(mi.Float, 1 / area)
-        self._size = dr.opaque(mi.Vector2f, [crop_width, crop_height])
+
+    def _read(self, sensor: mi.Sensor) -> mi.SceneParameters:
+        """Reads what sensors have in common."""
+        # By parameters, not by methods of the class: Mitsuba's integrators that nest ours pass the
+        # sensor as a plain ``mi.Sensor``
+        parameters, film = mi.traverse(sensor), sensor.film()
+        self._sensor = sensor
+        self._size = dr.opaque(mi.Vector2f, [int(n) for n in film.crop_size()])
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
         self._near = dr.opaque(mi.Float, parameters["near_clip"])
         self._far = dr.opaque(mi.Float, parameters["far_clip"])
+        return parameters
 
     @staticmethod
     def can_connect(sensor: mi.Sensor) -> bool:
@@ -108,14 +119,13 @@ class ConnectableSensor:
         pdf = self._inverse_area * dr.rcp(dr.select(active, cosine, 1) ** 3)
         return SensorConnection(
             ds.d, ds.dist, ds.p - ds.d * (self._near / dr.select(active, cosine, 1)),
-            ds.uv + self._offset, dr.select(active, pdf, 0),
-            dr.select(active, pdf / dr.square(ds.dist), 0), active,
+            ds.uv + self._offset, dr.select(active, pdf / dr.square(ds.dist), 0), active,
         ), weight  # fmt: skip
 
     def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:
         """The point of the aperture from which a camera ray comes (the ray itself begins at the
-        near clip plane), and the density of its direction, like :attr:`SensorConnection.pdf`.
-        """
+        near clip plane), and the density of the ray: per solid angle, and if rays are parallel, per
+        area across the ray. It integrates to 1 over the crop window."""
         axis = viewing_axis(self._sensor, ray.time)
         inverse = dr.rcp(dr.maximum(dr.dot(ray.d, axis), 1e-6))
         return ray.o - ray.d * (self._near * inverse), self._inverse_area * inverse**3
