@@ -92,10 +92,10 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
     longer; if the first pilot shows a small gain, learning ends. In spectral variants and with
     moving shapes there is little to choose from, and the selection stays uniform.
 
-    **Sensors and films.** Light paths can be connected to a :monosp:`perspective` or
-    :monosp:`thinlens` sensor; with other sensors, and with films that sample a border, there is no
-    light image. Lights of type :monosp:`directionalarea`, which :monosp:`path` does not find, are
-    rendered, but spectral variants refuse them.
+    **Sensors and films.** Light paths can be connected to a :monosp:`perspective`,
+    :monosp:`thinlens` or :monosp:`orthographic` sensor; with other sensors, and with films that
+    sample a border, there is no light image. Lights of type :monosp:`directionalarea`, which
+    :monosp:`path` does not find, are rendered, but spectral variants refuse them.
 
     Participating media are refused, because the light paths do not scatter in them (use
     :monosp:`sppm`, :monosp:`composed_path` or :monosp:`volpath`). Gradients are not supported (use

@@ -58,9 +58,9 @@ class LightTracerIntegrator(WalkIntegrator):
     :monosp:`directionalarea`, which :monosp:`path` does not find, are also rendered (spectral
     variants refuse them).
 
-    **Sensors and films.** The sensor must be a :monosp:`perspective` or :monosp:`thinlens`. The
-    film must be an :monosp:`hdrfilm`, with any filter and crop window, but without
-    :monosp:`sample_border`.
+    **Sensors and films.** The sensor must be a :monosp:`perspective`, :monosp:`thinlens` or
+    :monosp:`orthographic`; others, such as a :monosp:`batch`, are refused. The film must be an
+    :monosp:`hdrfilm`, with any filter and crop window, but without :monosp:`sample_border`.
 
     **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture
     are traced at the start of a render (at most 600 000 rays), and a table (at most 20 MiB) stores

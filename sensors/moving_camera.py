@@ -58,7 +58,8 @@ class MovingCamera(mi.Sensor):
     All integrators can use it, including Mitsuba's, with any film, crop window and sampler, also
     together with :monosp:`moving` shapes. If light paths can be connected to the nested sensor,
     they are connected to the lens at the time of the path: :monosp:`light_tracer`, :monosp:`bdpt`
-    and :monosp:`mlt` render with a moving :monosp:`perspective` or :monosp:`thinlens`. Mitsuba's
+    and :monosp:`mlt` render with a moving :monosp:`perspective` or :monosp:`thinlens`, the first
+    two also with a moving :monosp:`orthographic`. Mitsuba's
     :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs a single depth for each
     pixel, refuses moving cameras.
 

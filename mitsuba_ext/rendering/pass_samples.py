@@ -74,14 +74,15 @@ def _sampled(
     taken = lanes.lanes(sensor.film())
     numbers = camera.draw_numbers(sensor, sampler, taken, samples)
     rays = camera.camera_rays(sensor, taken, numbers, spp)
-    return rays, _estimated(estimator, scene, sampler, rays)
+    return rays, estimated(estimator, scene, sampler, rays)
 
 
 @frozen(any_width=True)
-def _estimated(
+def estimated(
     estimator: Estimator, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays
 ) -> Sample:
-    """The samples of these rays. It is recorded alone where the sensor cannot be recorded.
+    """The samples of these rays. It is recorded alone where the sensor, or what else is found along
+    the rays, cannot be recorded.
 
     Raises:
         GradientsError: The radiance has gradients.

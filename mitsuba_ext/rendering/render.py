@@ -29,7 +29,7 @@ from .interrupts import deferred_interrupt, interrupted
 from .mask_samples import MaskSamples
 from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
-from .pass_samples import GradientsError, count_rays, look, put_samples
+from .pass_samples import GradientsError, count_rays, estimated, look, put_samples
 from .plan import plan_render, whole_warps
 from .request import Request
 from .staged import Staged
@@ -328,7 +328,11 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if not self.freezes_passes or self._has_ray_aovs or self.masks is not None:
+        return not self._has_ray_aovs and self.masks is None and self._is_walk_frozen(stage)
+
+    def _is_walk_frozen(self, stage: Stage) -> bool:
+        """Whether the estimator of this stage is recorded, if not the whole pass."""
+        if not self.freezes_passes:
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False
@@ -374,9 +378,12 @@ class Job:
             self.masks.take(rays, count)
         if stage.observer is not None:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
-        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-        if dr.grad_enabled(sample.L):
-            raise GradientsError
+        if self._is_walk_frozen(stage) and stage.observer is None:
+            sample = estimated(stage.estimator, self.scene, sampler, rays)
+        else:
+            sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
+            if dr.grad_enabled(sample.L):
+                raise GradientsError
         aovs = sample.aovs
         if self._has_ray_aovs:
             aovs = aovs + self.integrator.sample_aovs(self.scene, sampler, rays.ray)

@@ -167,10 +167,27 @@ def test_a_sensor_sees_what_it_sees_with_path(changes: dict[str, Any]) -> None:
     assert_image_of_path(scene, 3, 1024)
 
 
-@pytest.mark.parametrize("plugin", ["orthographic", "radiancemeter"])
-def test_a_sensor_that_cannot_be_connected_to_is_named(plugin: str) -> None:
-    size = {"film": film(1, 1)} if plugin == "radiancemeter" else {}
-    scene = mi.load_dict(stage(camera=sensor(plugin, **size)))
+@pytest.mark.parametrize(
+    "turns", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["at rest", "moving"]
+)
+def test_an_orthographic_sensor_sees_what_it_sees_with_path(turns: bool) -> None:
+    """Its transform scales and shears, so that rays are not at right angles to the film, and the
+    clip planes cut through the scene."""
+    shear = mi.ScalarTransform4f([[1, 0, 0.15, 0], [0, 0.8, 0.1, 0], [0, 0, 3, 0], [0, 0, 0, 1]])
+    view = lookat([0.1, -4, 1.2], [0, 0, 0.6], [0, 0, 1]) @ shear
+    window = film(16, 16, rfilter={"type": "gaussian"}, crop_offset_x=2, crop_offset_y=4,
+                  crop_width=11, crop_height=7)  # fmt: skip
+    camera = sensor("orthographic", view, film=window, near_clip=0.7, far_clip=4.0)
+    if turns:
+        times = {"shutter_open": 0.0, "shutter_close": 1.0}
+        camera = {"type": "moving_camera", "angle": 20.0, "axis": [0, 1, 1],
+                  "translate": [0.3, 0, 0.2], "nested": {**camera, **times}}  # fmt: skip
+    scene = mi.load_dict(stage(camera=camera), optimize=False)
+    assert_image_of_path(scene, 3, 256, precision=0.03)
+
+
+def test_a_sensor_that_cannot_be_connected_to_is_named() -> None:
+    scene = mi.load_dict(stage(camera=sensor("radiancemeter", film=film(1, 1))))
     with pytest.raises(NotImplementedError, match='"light_tracer": .*perspective'):
         light_tracer().render(scene, spp=1)
 
