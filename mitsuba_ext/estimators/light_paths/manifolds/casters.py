@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,21 +22,39 @@ _SHAPES = ("Sphere", "Rectangle", "Disk", "Cylinder")
 #: The number of points on each caster near which searches begin: 16 KiB for each caster.
 _POINTS = 1024
 
-#: Words of a triangle: two edges and three normals.
-_WORDS = 16
+#: Words of a triangle: two edges and three normals. Words of a shape: see ``_shape_words``.
+_TRIANGLE, _SHAPE = 16, 16
 
 #: The entries of the table of shapes: no caster, a caster that is no mesh; from then on, the number
 #: of the first triangle.
 _NONE, _NO_MESH = 0, 1
 
 
+@dataclass
+class CasterPoint:
+    """A point of a caster.
+
+    Attributes:
+        p: The point.
+        normal, shading_normal: The geometric normal, of unknown sign, and the shading normal.
+        eta: The relative index of refraction of the inside; 0 for metal.
+        is_one_sided: Whether it reflects on the side of its normal only.
+    """
+
+    p: mi.Point3f
+    normal: mi.Normal3f
+    shading_normal: mi.Normal3f
+    eta: mi.Float
+    is_one_sided: mi.Bool
+
+
 class Casters:
-    """The casters of a scene.
+    """The casters of a scene. Their normals and indices of refraction lie in tables, because a
+    search for chains needs nothing else of a surface, and calls of shapes and BSDFs take longer.
 
     Attributes:
         exist: Whether there are any.
         refract: Whether some of them are glass.
-        has_meshes: Whether some of them are meshes.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -44,18 +64,20 @@ class Casters:
             return
         transmits = int(mi.BSDFFlags.DeltaTransmission)
         self.refract = any(int(shape.bsdf().flags()) & transmits for shape in shapes)
-        self.has_meshes = any(map(_has_triangles, shapes))
+        self._have_meshes = any(map(_has_triangles, shapes))
         ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        table, triangles, first = np.zeros(max(ids) + 1, np.uint32), [], 0
+        table, words = np.zeros(max(ids) + 1, np.uint32), np.zeros((max(ids) + 1, _SHAPE))
+        triangles, first = [], 0
         for index, shape in zip(ids, shapes):
-            table[index] = _NO_MESH
+            table[index], words[index] = _NO_MESH, _shape_words(shape)
             if _has_triangles(shape):
                 table[index] += 1 + first
                 triangles.append(_triangles(shape))
                 first += len(triangles[-1])
         self._table = from_numpy(mi.UInt32, table)
+        self._shapes = from_numpy(mi.Float, words.ravel())
         self._triangles = None
-        if self.has_meshes:
+        if self._have_meshes:
             self._triangles = from_numpy(mi.Float, np.concatenate(triangles).ravel())
         self._points = _points(shapes)
         self._count = dr.opaque(mi.UInt32, len(shapes) * _POINTS)
@@ -64,18 +86,41 @@ class Casters:
         """Whether ``shape`` is a caster."""
         return self._entry(shape) != _NONE
 
-    def triangle(
-        self, shape: mi.ShapePtr, index: mi.UInt32, active: mi.Bool
-    ) -> tuple[mi.Bool, list[mi.Vector3f]]:
-        """Whether ``shape`` is a mesh, and two edges and three normals of its triangle ``index``:
-        both edges begin at the first corner. Normals are 0 where they are not interpolated."""
-        entry = self._entry(shape)
-        is_mesh = active & (entry > _NO_MESH)
-        words = dr.gather(
-            mi.ArrayXf, self._triangles, entry - (_NO_MESH + 1) + index, is_mesh,
-            shape=(_WORDS, dr.width(entry)),
-        )  # fmt: skip
-        return is_mesh, [mi.Vector3f(words[i], words[i + 1], words[i + 2]) for i in range(0, 15, 3)]
+    def meet(
+        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[CasterPoint, NormalDerivative]:
+        """The point of a caster in which ``ray`` meets it, and how its shading normal changes."""
+        entry = self._entry(pi.shape)
+        active = active & (entry != _NONE)
+        index = dr.reinterpret_array(mi.UInt32, pi.shape)
+        w = dr.gather(
+            mi.ArrayXf, self._shapes, index, active, shape=(_SHAPE, dr.width(index))
+        )
+        p = ray(pi.t)
+        axis, curvature = _vector(w, 3), w[9]
+        to_p = p - _vector(w, 0)
+        n = _vector(w, 6) + (to_p - axis * dr.dot(axis, to_p)) * curvature
+        geometric, change = n, NormalDerivative(axis, curvature)
+        if self._have_meshes:
+            is_mesh = active & (entry > _NO_MESH)
+            words = dr.gather(
+                mi.ArrayXf, self._triangles, entry - (_NO_MESH + 1) + pi.prim_index, is_mesh,
+                shape=(_TRIANGLE, dr.width(entry)),
+            )  # fmt: skip
+            e1, e2, n0, n1, n2 = (_vector(words, i) for i in range(0, 15, 3))
+            b = pi.prim_uv
+            shading = n0 * (1 - b.x - b.y) + n1 * b.x + n2 * b.y
+            length = dr.norm(shading)
+            inverse = dr.select(length > 0, dr.rcp(length), 0)
+            shading *= inverse
+            change.on_meshes(is_mesh, e1, e2, *(
+                inverse * (x - shading * dr.dot(shading, x)) for x in (n1 - n0, n2 - n0)
+            ))  # fmt: skip
+            n = dr.select(is_mesh, shading, n)
+            flat = dr.cross(e1, e2)
+            geometric = dr.select(is_mesh, flat * dr.rsqrt(dr.squared_norm(flat)), geometric)
+        point = CasterPoint(p, mi.Normal3f(geometric), mi.Normal3f(n), w[10], w[11] > 0)
+        return point, change
 
     def near(self, u: mi.Float, v: mi.Vector3f, w: mi.Float) -> mi.Point3f:
         """A random point near a caster. Its density is positive everywhere: a caster may be long
@@ -112,23 +157,106 @@ def _has_triangles(shape: mi.Shape) -> bool:
     return shape.is_mesh() and shape.class_name() not in _SHAPES
 
 
+def _shape_words(shape: mi.Shape) -> np.ndarray:
+    """The words of a shape. The normal at p is n + curvature · (v - axis (axis · v)), where v =
+    p - centre: words 0 to 2 are the centre, 3 to 5 the axis, 6 to 8 n, and 9 the curvature; they
+    are 0 for meshes. 10: the relative index of refraction, 0 for metal. 11: whether only one side
+    reflects."""
+    words = np.zeros(_SHAPE)
+    words[10:12] = _eta(shape.bsdf()), shape.bsdf().class_name() == "SmoothConductor"
+    if _has_triangles(shape):
+        return words
+    p, n = _some_points(shape)
+    if shape.class_name() in ("Rectangle", "Disk"):
+        words[6:9] = n[0]
+        return words
+    if shape.class_name() == "Cylinder":
+        # All its normals are perpendicular to its axis
+        words[3:6] = np.linalg.eigh(n.T @ n)[1][:, 0]
+        p -= np.outer(p @ words[3:6], words[3:6])
+    # p = centre + n / curvature
+    dp, dn = p - p.mean(0), n - n.mean(0)
+    words[9] = (dn * dn).sum() / (dp * dn).sum()
+    words[0:3] = p.mean(0) - n.mean(0) / words[9]
+    return words
+
+
+def _eta(bsdf: mi.BSDF) -> float:
+    """The relative index of refraction of the inside; 0 for metal."""
+    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission):
+        return 0.0
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, 1)
+    si.wavelengths = mi.Spectrum(550) if mi.is_spectral else mi.Color0f()
+    bs, _weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(1), mi.Point2f(0.5), mi.Bool(True))
+    return float(np.array(bs.eta).ravel()[0])
+
+
 def _triangles(mesh: mi.Mesh) -> np.ndarray:
     """The words of the triangles of a mesh; shape [triangles, words]."""
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
     p0, p1, p2 = (np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)[i] for i in faces.T)
-    words = np.zeros((len(faces), _WORDS), np.float32)
+    words = np.zeros((len(faces), _TRIANGLE), np.float32)
     words[:, 0:3], words[:, 3:6] = p1 - p0, p2 - p0
+    # The normal in the middle of each triangle, flipped as the mesh flips it
+    pi = dr.zeros(mi.PreliminaryIntersection3f, len(faces))
+    pi.t, pi.valid, pi.shape = mi.Float(1), mi.Bool(True), mi.ShapePtr(mesh)
+    pi.prim_uv, pi.prim_index = mi.Point2f(1 / 3), dr.arange(mi.UInt32, len(faces))
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    middle = np.array(si.sh_frame.n).T
+    words[:, 6:15] = np.tile(middle, 3)
     if mesh.has_vertex_normals():
-        normals = np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)
-        words[:, 6:15] = normals[faces].reshape(-1, 9)
+        normals = np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)[faces]
+        side = np.sign((normals.sum(1) * middle).sum(1))
+        words[:, 6:15] = (normals * side[:, None, None]).reshape(-1, 9)
     return words
+
+
+def _vector(words: mi.ArrayXf, index: int) -> mi.Vector3f:
+    return mi.Vector3f(*(words[index + i] for i in range(3)))
 
 
 def _points(shapes: list[mi.Shape]) -> mi.Float:
     """Points on the shapes, each with about twice the distance to the next one."""
-    numbers = hashed_2d(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
     table = np.zeros((len(shapes), _POINTS, 4), np.float32)
     for row, shape in zip(table, shapes):
-        row[:, :3] = np.array(shape.sample_position(mi.Float(0), numbers).p).T
+        row[:, :3] = _some_points(shape)[0]
         row[:, 3] = 2 * np.sqrt(np.array(shape.surface_area()).ravel()[0] / _POINTS)
     return from_numpy(mi.Float, table.ravel())
+
+
+def _some_points(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Points on a shape, and their normals."""
+    numbers = hashed_2d(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
+    ps = shape.sample_position(mi.Float(0), numbers)
+    return np.array(ps.p, np.float64).T, np.array(ps.n, np.float64).T
+
+
+class NormalDerivative:
+    """How the shading normal changes along a surface: curvature · (dp - axis (axis · dp))."""
+
+    def __init__(self, axis: mi.Vector3f, curvature: mi.Float) -> None:
+        self._axis, self._curvature, self._on_mesh = axis, curvature, None
+
+    def on_meshes(
+        self, is_mesh: mi.Bool, u: mi.Vector3f, v: mi.Vector3f, n_u: mi.Vector3f, n_v: mi.Vector3f
+    ) -> None:
+        """Sets the changes ``n_u`` and ``n_v`` along two vectors ``u`` and ``v`` in a triangle.
+
+        The derivatives of an interaction are wrong in Mitsuba 3.9.1 where a mesh has texture
+        coordinates."""
+        uu, uv, vv = dr.dot(u, u), dr.dot(u, v), dr.dot(v, v)
+        det = uu * vv - uv * uv
+        inverse = dr.select(det > 0, dr.rcp(det), 0)
+        # The vectors whose products with a step are its coordinates
+        a, b = (vv * u - uv * v) * inverse, (uu * v - uv * u) * inverse
+        self._on_mesh = is_mesh, a, b, n_u, n_v
+
+    def along(self, dp: mi.Vector3f) -> mi.Vector3f:
+        """The change of the normal for a step ``dp`` along the surface."""
+        change = self._curvature * (dp - self._axis * dr.dot(self._axis, dp))
+        if self._on_mesh is None:
+            return change
+        is_mesh, a, b, n_u, n_v = self._on_mesh
+        return dr.select(is_mesh, n_u * dr.dot(a, dp) + n_v * dr.dot(b, dp), change)

@@ -24,8 +24,8 @@ class RayState:
         p, d: The last vertex, and the direction in which the ray leaves it.
         o: Where a ray that leaves the vertex starts, clear of the surface.
         p_s, p_t, d_s, d_t: Derivatives of ``p`` and ``d``.
-        weight: Product of the values of the BSDFs.
-        chance: Product of the probabilities with which the BSDFs sample these directions.
+        weight: Product of the values of the BSDFs; 1 if they were not asked.
+        chance: Product of the probabilities with which the BSDFs sample these directions, or 1.
         length: The number of surfaces.
         is_sound: Whether there is such a chain.
     """
@@ -59,12 +59,12 @@ class Chains:
     @dr.syntax
     def trace(
         self, start: mi.Ray3f, length: mi.UInt32, transmits: mi.UInt32, is_open: mi.Bool,
-        active: mi.Bool,
+        active: mi.Bool, weighs: bool = False,
     ) -> RayState:
         """The chain of ``length`` surfaces that begins with the ray ``start``. Bit i of
         ``transmits`` tells whether its surface i transmits or reflects. Where ``is_open``, the
         chain ends before the first surface that is no caster, and ``length`` is its longest
-        length."""
+        length. BSDFs are asked only if it ``weighs`` the chain."""
         frame = mi.Frame3f(start.d)
         ray = mi.Ray3f(start)
         state = RayState(
@@ -75,91 +75,69 @@ class Chains:
         going = mi.Bool(active) & (length > 0)
         while dr.hint(going, label="chain"):
             pi = self._query.closest(self._scene, ray, coherent=False, active=going)
-            hit = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
-            met = going & hit.is_valid() & self._casters.contain(hit.shape)
+            met = going & pi.is_valid() & self._casters.contain(pi.shape)
             transmit = ((transmits >> state.length) & 1) == 1
-            lobe = dr.select(transmit, mi.Float(1), 0)
-            bs, weight = sample_bsdf(
-                hit.bsdf(ray), self._ctx, hit, lobe, mi.Point2f(0.5), met
-            )
-            kind = dr.select(
-                transmit, mi.UInt32(int(mi.BSDFFlags.DeltaTransmission)),
-                mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
-            )
-            sound = met & (bs.pdf > 0) & ((bs.sampled_type & kind) != 0)
-            out = hit.to_world(bs.wo)
-            self._differentiate(state, ray, hit, pi, bs.eta, out, transmit, sound)
-            leaving = self._query.starts.along(hit, out)
-            state.p = dr.select(sound, hit.p, state.p)
-            state.d = dr.select(sound, out, state.d)
-            state.o = dr.select(sound, leaving.o, state.o)
-            state.weight = dr.select(sound, state.weight * (weight * bs.pdf), state.weight)
-            state.chance = dr.select(sound, state.chance * bs.pdf, state.chance)
+            sound = self._bend(state, ray, pi, transmit, met)
+            self._weigh(state, ray, pi, transmit, sound, weighs)
             ends = is_open & ~met & (state.length > 0)
             state.is_sound &= ~going | sound | ends
-            ray = leaving
+            ray.o = dr.select(sound, state.o, ray.o)
+            ray.d = dr.select(sound, state.d, ray.d)
             state.length += dr.select(sound, mi.UInt32(1), 0)
             going = sound & (state.length < length)
         return state
 
-    def _differentiate(self, state, ray, hit, pi, eta, out, transmit, sound) -> None:
-        """Transfers the derivatives along ``ray`` to the surface ``hit``, where the ray turns to
-        ``out``."""
-        n = hit.sh_frame.n
-        side = dr.sign(-dr.dot(n, ray.d))
-        m = n * side
-        c = -dr.dot(ray.d, m)
-        e = dr.select(transmit, dr.rcp(eta), 1)
-        cosine = -dr.dot(out, m)  # negative where the ray is reflected
-        change = NormalDerivative(hit, pi, self._casters, sound)
+    def _bend(self, state, ray, pi, transmit, met) -> mi.Bool:
+        """Moves ``state`` along ``ray`` to the surface that it meets, and turns the ray there, with
+        the derivatives. Returns whether the surface reflects or transmits it."""
+        point, change = self._casters.meet(pi, ray, met)
+        n, is_glass = point.shading_normal, point.eta > 0
+        front = -dr.dot(n, ray.d)
+        side = dr.sign(front)
+        m, c = n * side, dr.abs(front)
+        # Relative index of refraction of the side from which the ray comes
+        e = dr.select(transmit, dr.select(front > 0, dr.rcp(point.eta), point.eta), 1)
+        square = 1 - dr.square(e) * (1 - dr.square(c))
+        # Negative where the ray is reflected
+        cosine = dr.select(transmit, dr.sqrt(dr.maximum(square, 0)), -c)
+        sound = met & (c > 0) & (~transmit | (is_glass & (square > 0)))
+        sound &= transmit | ~point.is_one_sided | (front > 0)
+        μ = e * c - cosine
+        out = dr.normalize(e * ray.d + μ * m)
+        geometric = point.normal
         for i in ("s", "t"):
             dd, dp = getattr(state, "d_" + i), getattr(state, "p_" + i)
             # Transfer
-            dp = dp + hit.t * dd
-            dp = dp - ray.d * (dr.dot(hit.n, dp) / dr.dot(hit.n, ray.d))
+            dp = dp + pi.t * dd
+            dp = dp - ray.d * (dr.dot(geometric, dp) / dr.dot(geometric, ray.d))
             # Reflection and refraction: out = e d + μ m
             dm = change.along(dp) * side
             dc = -(dr.dot(dd, m) + dr.dot(ray.d, dm))
-            μ = e * c - cosine
             dμ = dr.select(transmit, e * dc - dr.square(e) * c * dc / cosine, 2 * dc)
             setattr(state, "p_" + i, dr.select(sound, dp, getattr(state, "p_" + i)))
             setattr(state, "d_" + i, dr.select(sound, e * dd + dμ * m + μ * dm, dd))
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p, si.n = point.p, geometric
+        state.p = dr.select(sound, point.p, state.p)
+        state.d = dr.select(sound, out, state.d)
+        state.o = dr.select(sound, self._query.starts.along(si, out).o, state.o)
+        return sound
 
-
-class NormalDerivative:
-    """How the shading normal changes along the surface at an interaction.
-
-    It does not use the interaction's derivatives on meshes, because these are wrong in Mitsuba
-    3.9.1 where a mesh has texture coordinates.
-    """
-
-    def __init__(self, si: mi.SurfaceInteraction3f, pi, casters: Casters, active) -> None:
-        # Two vectors in the surface, and the normal's change along them
-        self._u, self._v, self._n_u, self._n_v = si.dp_du, si.dp_dv, si.dn_du, si.dn_dv
-        if casters.has_meshes:
-            is_mesh, (e1, e2, n0, n1, n2) = casters.triangle(si.shape, pi.prim_index, active)
-            b = pi.prim_uv
-            n = n0 * (1 - b.x - b.y) + n1 * b.x + n2 * b.y
-            length = dr.norm(n)
-            inverse = dr.select(length > 0, dr.rcp(length), 0)  # 0: flat triangles
-            n = n * inverse
-            inverse = inverse * dr.sign(dr.dot(n, si.sh_frame.n))
-            n_u, n_v = (inverse * (x - n * dr.dot(n, x)) for x in (n1 - n0, n2 - n0))
-            self._u, self._v, self._n_u, self._n_v = (
-                dr.select(is_mesh, x, y)
-                for x, y in ((e1, self._u), (e2, self._v), (n_u, self._n_u), (n_v, self._n_v))
-            )
-        uu, uv, vv = (
-            dr.dot(a, b) for a, b in ((self._u, self._u), (self._u, self._v), (self._v, self._v))
-        )
-        det = uu * vv - uv * uv
-        inverse = dr.select(det > 0, dr.rcp(det), 0)
-        self._a, self._b, self._c = vv * inverse, -uv * inverse, uu * inverse
-
-    def along(self, dp: mi.Vector3f) -> mi.Vector3f:
-        """The change of the normal for a step ``dp`` along the surface."""
-        x, y = dr.dot(dp, self._u), dr.dot(dp, self._v)
-        return self._n_u * (self._a * x + self._b * y) + self._n_v * (self._b * x + self._c * y)
+    def _weigh(self, state, ray, pi, transmit, sound, weighs: bool) -> None:
+        """Multiplies the weight and the chance of ``state`` by those of the surface it has met."""
+        if not weighs:
+            return
+        hit = pi.compute_surface_interaction(ray, mi.RayFlags.All, sound)
+        lobe = dr.select(transmit, mi.Float(1), 0)
+        bs, weight = sample_bsdf(hit.bsdf(ray), self._ctx, hit, lobe, mi.Point2f(0.5), sound)
+        kind = dr.select(
+            transmit, mi.UInt32(int(mi.BSDFFlags.DeltaTransmission)),
+            mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
+        )  # fmt: skip
+        agrees = (bs.pdf > 0) & ((bs.sampled_type & kind) != 0)
+        state.weight = dr.select(sound, state.weight * (weight * bs.pdf), state.weight)
+        state.chance = dr.select(sound, state.chance * bs.pdf, state.chance)
+        state.is_sound &= ~sound | agrees
 
 
 def some_wavelengths() -> mi.Spectrum:

@@ -96,7 +96,7 @@ class ManifoldConnections:
         active &= found.length > 0
         end = self._chains.trace(
             self._query.starts.along(si, found.d), found.length, found.transmits, mi.Bool(False),
-            active,
+            active, weighs=True,
         )
         miss = missed(end, target)
         active &= miss.is_sound
@@ -176,7 +176,7 @@ class ManifoldConnections:
         index = self._emission.index(ds.emitter, active)
         direction *= self._emission.chance(index, active)
         by_us = _ASSUMED_CHANCE * dr.select(is_infinite, direction, position)
-        by_scattering = h.pdf * chain.chance * miss.density
+        by_scattering = h.pdf * miss.density
         by_scattering *= dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
         return dr.select(active & miss.is_sound, power_heuristic(by_scattering, by_us), 1)
 

@@ -25,7 +25,8 @@ class History:
     """The casters that a path has met since the last vertex that could be connected.
 
     Attributes:
-        o, d, pdf: Origin and direction of the ray that left the vertex, and its density.
+        o, d: Origin and direction of the ray that left the vertex.
+        pdf: The density of the direction · the probabilities with which the casters were sampled.
         length: The number of casters; ``_NEVER`` where no connection finds the path.
         transmits: Bit i tells whether caster i has transmitted the ray.
         lane: The number of the path.
@@ -74,7 +75,7 @@ class ManifoldProgram(PathProgram):
         return History(
             dr.select(is_delta, h.o, ray.o),
             dr.select(is_delta, h.d, ray.d),
-            dr.select(is_delta, h.pdf, bs.pdf),
+            dr.select(is_delta, h.pdf, 1) * bs.pdf,
             dr.select(is_delta, dr.select(passes, h.length + 1, _NEVER), 0),
             dr.select(is_delta, h.transmits | bit, 0),
             h.lane,
