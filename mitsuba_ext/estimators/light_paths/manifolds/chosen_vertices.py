@@ -65,15 +65,14 @@ class ChosenVertices(Subpaths):
         dr.schedule(self._words, self._totals)
 
     def load(
-        self,
+        self, path: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, mi.UInt32, mi.UInt32, mi.Bool]:
-        """The chosen vertex of each path: the interaction, the throughput / probability of the
-        choice, the depth, the seed of the random numbers of its connection, and whether there is
-        any."""
-        lane = dr.arange(mi.UInt32, self._lanes)
-        total = dr.gather(mi.Float, self._totals, lane)
-        exists = total > 0
-        w = dr.gather(mi.ArrayXf, self._words, lane, exists, shape=(self._size, self._lanes))
+        """The chosen vertex of a path: the interaction, the throughput / probability of the choice,
+        the depth, the seed of the random numbers of its connection, and whether there is any."""
+        total = dr.gather(mi.Float, self._totals, path, active)
+        exists = active & (total > 0)
+        shape = self._size, dr.width(path)
+        w = dr.gather(mi.ArrayXf, self._words, path, exists, shape=shape)
         β, (importance, seed, depth, *words) = (
             mi.Spectrum(*(w[i] for i in range(self._channels))),
             (w[i] for i in range(self._channels, self._size)),

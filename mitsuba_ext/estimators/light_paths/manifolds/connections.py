@@ -23,7 +23,7 @@ from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertices
-from .solver import Seed, Solver, Target, Tasks, missed
+from .solver import Found, Queue, Seed, Solver, Target, Tasks, Vertex, missed
 
 #: The most surfaces of a chain: in and out of a piece of glass.
 MOST_SURFACES = 2
@@ -78,22 +78,55 @@ class ManifoldConnections:
         self, vertices: ChosenVertices, rays: CameraRays
     ) -> tuple[mi.Spectrum, mi.UInt32]:
         """The radiance of one connection for each path, throughput included, and the number of
-        shadow rays."""
-        si, β, depth, seed, active = vertices.load()
-        si.time, si.wavelengths = rays.ray.time, rays.ray.wavelengths
+        shadow rays.
+
+        Each step is a kernel of its own, with lanes only for paths for which there is something to
+        do."""
+        lane = dr.arange(mi.UInt32, dr.width(rays.ray))
+        si, _β, depth, light, seed, active = self._chosen(vertices, rays, lane, mi.Bool(True))
+        tasks = Tasks(Vertex(si, self._target(light), seed, self.most_surfaces(depth)))
+        searched = Queue(active & (light.probability > 0))
+        dr.eval(tasks.words)
+        found = self._solver.find(tasks, searched)
+        solved = Queue(found.length > 0)
+        dr.eval(found)
+        path, active = solved.all()
+        of_path = dr.gather(Found, found, path, active)
+        L, tested = self._light_of(of_path, *self._chosen(vertices, rays, path, active))
+        light_of_path = dr.zeros(mi.Spectrum, tasks.count)
+        shadow_count = dr.zeros(mi.UInt32, tasks.count)
+        dr.scatter(light_of_path, L, path, active)
+        dr.scatter(shadow_count, dr.select(tested, mi.UInt32(1), 0), path, active)
+        dr.eval(light_of_path, shadow_count)
+        lit = Queue(dr.max(dr.abs(light_of_path)) > 0)
+        trials = self._solver.count(tasks, lit, found)
+        return light_of_path * mi.Float(trials), shadow_count
+
+    def _chosen(
+        self, vertices: ChosenVertices, rays: CameraRays, path: mi.UInt32, active: mi.Bool
+    ) -> tuple:
+        """The chosen vertices of paths, as :meth:`ChosenVertices.load` returns them, and a point of
+        a light for each."""
+        si, β, depth, seed, active = vertices.load(path, active)
+        si.time = dr.gather(mi.Float, rays.ray.time, path, active)
+        si.wavelengths = dr.gather(type(si.wavelengths), rays.ray.wavelengths, path, active)
         numbers = _HashedNumbers(seed, mi.UInt32(_LIGHT_NUMBERS))
         light = self._emission.sample(numbers, si.time, si.wavelengths, active)
-        target = Target(
+        return si, β, depth, light, seed, active
+
+    def _target(self, light: EmittedRay) -> Target:
+        return Target(
             dr.select(light.is_infinite, mi.Point3f(-light.ray.d), light.start.p),
             light.is_infinite,
         )
-        active &= light.probability > 0
-        tasks = Tasks(si, target, seed, dr.select(active, self.most_surfaces(depth), 0))
-        # The search has few lanes, and is a kernel of its own
-        dr.eval(tasks.words)
-        found = self._solver.find(tasks)
-        dr.eval(found)
-        active &= found.length > 0
+
+    def _light_of(
+        self, found: Found, si: mi.SurfaceInteraction3f, β: mi.Spectrum, depth: mi.UInt32,
+        light: EmittedRay, seed: mi.UInt32, active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """The radiance that chains bring, · the probability of finding them, and whether there was
+        a shadow ray."""
+        target = self._target(light)
         end = self._chains.trace(
             self._query.starts.along(si, found.d), found.length, found.transmits, mi.Bool(False),
             active, weighs=True,
@@ -108,10 +141,10 @@ class ManifoldConnections:
         by_us *= _ASSUMED_CHANCE
         mis = power_heuristic(by_us, pdf * end.chance * miss.density * cosine)
         mis = dr.select(light.is_delta_position | light.is_delta_direction, 1, mis)
-        L = β * value * end.weight * emitted * (miss.density * mi.Float(found.trials) * mis)
+        L = β * value * end.weight * emitted * (miss.density * mis)
         tested = active & (dr.max(dr.abs(L)) > 0)
         visible = tested & ~self._scene.ray_test(_last_ray(end, target), active=tested)
-        return dr.select(visible, L, 0), dr.select(tested, mi.UInt32(1), 0)
+        return dr.select(visible, L, 0), tested
 
     def _emitted(
         self, light: EmittedRay, end: RayState, active: mi.Bool
@@ -135,10 +168,9 @@ class ManifoldConnections:
         # Its weight contains the density of the disk on which light paths begin
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
 
-    def _seed(
-        self, seed: mi.UInt32, trial: mi.UInt32, si: mi.SurfaceInteraction3f, target: Target
-    ) -> Seed:
+    def _seed(self, vertex: Vertex, trial: mi.UInt32) -> Seed:
         """Where a trial begins: towards a random point near a caster, or towards the light."""
+        si, target, seed = vertex.si, vertex.target, vertex.seed
         a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
         d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
         if not self._casters.refract:

@@ -28,9 +28,8 @@ _LEAST_SHARE = 1 / 64
 #: Two trials have found the same chain if their first directions differ by less than this angle:
 #: more than rounding, less than the distance of different chains.
 _SAME = 3e-4
-#: The number of tasks that a lane takes, one after the other: see :meth:`Solver.find`. (pool: 2.5
-#: times as fast as one task for each lane.)
-_TASKS_PER_LANE = 16
+#: The number of lanes is smaller than the number of paths by this factor: see :class:`Queue`.
+_PATHS_PER_LANE = 16
 #: Trials end here. In pool, one chain in 10^6 needs more.
 _MOST_TRIALS = 1 << 16
 
@@ -89,40 +88,52 @@ def missed(end: RayState, target: Target) -> Miss:
     )
 
 
+@dataclass
+class Vertex:
+    """From where a chain is searched for.
+
+    Attributes:
+        si: The vertex; only its position and normal are set.
+        target: Where the chain should end.
+        seed: The seed of the path's random numbers.
+        most: The most surfaces of the chain.
+    """
+
+    si: mi.SurfaceInteraction3f
+    target: Target
+    seed: mi.UInt32
+    most: mi.UInt32
+
+
 # Not a dataclass: loops only read it
 class Tasks:
     """What is searched for: one chain for each path of a pass, or none.
 
     Attributes:
         words: For each: the vertex (position and normal), the target, the seed of its random
-            numbers, and the longest chain (0 where nothing is searched; a bit for lights at
-            infinity).
+            numbers, and the longest chain, with a bit for lights at infinity.
         count: Number of paths.
     """
 
     _WORDS = 11
     _INFINITE = 256
 
-    def __init__(
-        self, si: mi.SurfaceInteraction3f, target: Target, seed: mi.UInt32, most: mi.UInt32
-    ) -> None:
-        self.count = dr.width(seed)
-        mark = most | dr.select(target.is_infinite, mi.UInt32(self._INFINITE), 0)
-        words = [*si.p, *si.n, *target.p, as_float(seed), as_float(mark)]
+    def __init__(self, vertices: Vertex) -> None:
+        v, self.count = vertices, dr.width(vertices.seed)
+        mark = v.most | dr.select(v.target.is_infinite, mi.UInt32(self._INFINITE), 0)
+        words = [*v.si.p, *v.si.n, *v.target.p, as_float(v.seed), as_float(mark)]
         self.words = dr.empty(mi.Float, self.count * self._WORDS)
         dr.scatter(self.words, mi.ArrayXf(words), dr.arange(mi.UInt32, self.count))
 
-    def at(
-        self, index: mi.UInt32, active: mi.Bool
-    ) -> tuple[mi.SurfaceInteraction3f, Target, mi.UInt32, mi.UInt32]:
-        """Vertex, target, seed and longest chain of a path."""
-        w = dr.gather(mi.ArrayXf, self.words, index, active, shape=(self._WORDS, dr.width(index)))
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    def at(self, path: mi.UInt32, active: mi.Bool) -> Vertex:
+        """The vertex of a path."""
+        w = dr.gather(mi.ArrayXf, self.words, path, active, shape=(self._WORDS, dr.width(path)))
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.p, si.n = mi.Point3f(w[0], w[1], w[2]), mi.Normal3f(w[3], w[4], w[5])
         si.wavelengths = some_wavelengths()
         seed, mark = (dr.reinterpret_array(mi.UInt32, word) for word in (w[9], w[10]))
         target = Target(mi.Point3f(w[6], w[7], w[8]), (mark & self._INFINITE) != 0)
-        return si, target, seed, mark & (self._INFINITE - 1)
+        return Vertex(si, target, seed, mark & (self._INFINITE - 1))
 
 
 @dataclass
@@ -148,18 +159,65 @@ class Found:
         d: The first direction.
         length: The number of surfaces; 0 if none was found.
         transmits: Bit i tells whether surface i transmits or reflects.
-        trials: The number of further trials until one found the same chain. Its mean is 1 / the
-            probability of finding it.
     """
 
     d: mi.Vector3f
     length: mi.UInt32
     transmits: mi.UInt32
-    trials: mi.UInt32
+
+
+# Not a dataclass: loops only read it
+class Queue:
+    """The paths for which there is something to do. Lanes take them one after the other.
+
+    Dr.Jit works on 8 to 32 lanes at once, and all wait for the slowest, which may need thousands of
+    trials: so a lane that is done takes the next path."""
+
+    def __init__(self, active: mi.Bool) -> None:
+        count = dr.width(active)
+        self._size, self._taken = (dr.zeros(mi.UInt32, 1) for _ in range(2))
+        self._paths = dr.empty(mi.UInt32, count)
+        place = dr.scatter_inc(self._size, mi.UInt32(0), active)
+        dr.scatter(self._paths, dr.arange(mi.UInt32, count), place, active)
+        dr.eval(self._size, self._paths, self._taken)
+
+    def next(self, path: mi.UInt32, idle: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The next path for idle lanes, ``path`` for others, and whether there is one."""
+        following, exists = self._at(dr.scatter_inc(self._taken, mi.UInt32(0), idle), idle)
+        return dr.select(idle, following, path), ~idle | exists
+
+    def all(self) -> tuple[mi.UInt32, mi.Bool]:
+        """The paths, in the first lanes of a kernel with as many lanes as there are paths."""
+        return self._at(dr.arange(mi.UInt32, dr.width(self._paths)), mi.Bool(True))
+
+    def _at(self, place: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        exists = active & (place < dr.gather(mi.UInt32, self._size, mi.UInt32(0)))
+        return dr.gather(mi.UInt32, self._paths, place, exists), exists
+
+
+@dataclass
+class NewtonWalk:
+    """A trial: the first direction of a chain, which Newton's steps improve.
+
+    Attributes:
+        d, error: The best direction until now, and by how far its chain misses the target.
+        step: The next step from there.
+        share: How much of it is taken.
+        steps: The number of steps.
+        length, transmits: The chain.
+    """
+
+    d: mi.Vector3f
+    error: mi.Float
+    step: mi.Vector2f
+    share: mi.Float
+    steps: mi.UInt32
+    length: mi.UInt32
+    transmits: mi.UInt32
 
 
 class Solver:
-    """Finds chains from random seeds by Newton's method, and estimates how likely that was.
+    """Finds chains from seeds by Newton's method, and estimates how likely that was.
 
     Parameters:
         chains: Traces chains.
@@ -172,82 +230,94 @@ class Solver:
         self._chains, self._starts, self._seed = chains, starts, seed
 
     @dr.syntax
-    def find(self, tasks: Tasks) -> Found:
-        """The chains that first trials find. Further trials follow until one finds it again.
-
-        Dr.Jit works on 8 to 32 lanes at once, and all wait for the slowest, which may need
-        thousands of trials. So a lane takes several tasks, one after the other: their sums differ
-        less."""
-        lanes = -(-tasks.count // _TASKS_PER_LANE)
-        result = dr.zeros(mi.Float, 3 * tasks.count)
-        result_pattern = dr.zeros(mi.UInt32, tasks.count)
-        result_trials = dr.zeros(mi.UInt32, tasks.count)
-        count, stride = dr.opaque(mi.UInt32, tasks.count), dr.opaque(mi.UInt32, lanes)
-
-        # --------------------- Configure the loop state ----------------------
-        task = dr.arange(mi.UInt32, lanes)
-        trial, steps = mi.UInt32(0), mi.UInt32(0)
-        transmits, length = mi.UInt32(0), mi.UInt32(0)
-        best_d, best_error = mi.Vector3f(0), mi.Float(dr.inf)
-        step, share = mi.Vector2f(0), mi.Float(1)       # Newton's next step, and how much of it
-        found_d, found_pattern = mi.Vector3f(0), mi.UInt32(0)
-        going = task < count
-
-        while dr.hint(going, label="manifold walk"):
-            si, target, seed, most = tasks.at(task, going)
-            tried = going & (most > 0)
-
-            # ----- A new trial, or the next step -----
-            begins = steps == 0
-            new = self._seed(seed, trial, si, target)
-            is_open = begins & new.is_open
-            transmits = dr.select(begins, new.transmits, transmits)
-            length = dr.select(begins, dr.select(is_open, most, 1), length)
-            d = dr.select(begins, new.d, _turned(best_d, step, share))
-            best_error = dr.select(begins, dr.inf, best_error)
-            share = dr.select(begins, 1, share)
-            end = self._chains.trace(self._starts.along(si, d), length, transmits, is_open, tried)
-            length = dr.select(begins, end.length, length)
-            miss = missed(end, target)
-
-            # ----- Does it come closer? -----
-            better = tried & miss.is_sound & (miss.error < best_error)
-            best_error = dr.select(better, miss.error, best_error)
-            best_d = dr.select(better, d, best_d)
-            step = dr.select(better, mi.Vector2f(miss.step_s, miss.step_t), step)
-            turn = dr.norm(step)
-            share = dr.select(better, dr.minimum(1, 2 * share), 0.5 * share)
-            # A step of more than a radian leaves what the derivatives describe
-            share = dr.minimum(share, dr.rcp(turn))
-            steps += 1
-            solved = better & (miss.error < _LEAST_ERROR) & (turn < _LEAST_TURN)
-            fails = (steps >= _MOST_STEPS) | (share < _LEAST_SHARE) | ~dr.isfinite(best_error)
-            ends = solved | fails | ~tried
-
-            # ----- The first trial, or one of those that follow -----
-            pattern = (end.length << 2) | (transmits & ((1 << end.length) - 1))
-            solution = _turned(d, step, mi.Float(1))
-            is_first = solved & (trial == 0)
-            found_d = dr.select(is_first, solution, found_d)
-            found_pattern = dr.select(is_first, pattern, found_pattern)
-            is_same = solved & (trial > 0) & (pattern == found_pattern)
-            is_same &= dr.squared_norm(solution - found_d) < _SAME**2
-            finishes = ends & ((found_pattern == 0) | is_same | (trial >= _MOST_TRIALS))
-            record = going & finishes & (found_pattern != 0)
+    def find(self, tasks: Tasks, queue: Queue) -> Found:
+        """The chains that one trial for each path of ``queue`` finds."""
+        found_d = dr.zeros(mi.Float, 3 * tasks.count)
+        found_pattern = dr.zeros(mi.UInt32, tasks.count)
+        count = dr.opaque(mi.UInt32, tasks.count)
+        idle = dr.full(mi.Bool, True, _lanes(tasks.count))
+        path, going, walk = mi.UInt32(0), mi.Bool(True), _new_walk()
+        while dr.hint(going, label="first trial"):
+            path, going = queue.next(path, idle)
+            vertex = tasks.at(path, going)
+            solved, ends, pattern, d = self._advance(walk, vertex, mi.UInt32(0), going)
             for i in range(3):
-                dr.scatter(result, found_d[i], task + i * count, record)
-            dr.scatter(result_pattern, found_pattern, task, record)
-            dr.scatter(result_trials, trial, task, record)
-
-            # ----- Move on to the next trial, or the next task -----
-            steps = dr.select(ends, 0, steps)
-            trial = dr.select(finishes, 0, trial + dr.select(ends, 1, 0))
-            found_pattern = dr.select(finishes, 0, found_pattern)
-            task += dr.select(finishes, stride, 0)
-            going = task < count
+                dr.scatter(found_d, d[i], path + i * count, solved)
+            dr.scatter(found_pattern, pattern, path, solved)
+            walk.steps = dr.select(ends, 0, walk.steps)
+            idle = ends
         index = dr.arange(mi.UInt32, tasks.count)
-        d = mi.Vector3f(*(dr.gather(mi.Float, result, index + i * count) for i in range(3)))
-        return Found(d, result_pattern >> 2, result_pattern & 3, result_trials)
+        d = mi.Vector3f(*(dr.gather(mi.Float, found_d, index + i * count) for i in range(3)))
+        return Found(d, found_pattern >> 2, found_pattern & 3)
+
+    @dr.syntax
+    def count(self, tasks: Tasks, queue: Queue, found: Found) -> mi.UInt32:
+        """How many further trials it takes to find a chain again, for each path of ``queue``. The
+        mean of this number is 1 / the probability of finding it."""
+        result = dr.zeros(mi.UInt32, tasks.count)
+        idle = dr.full(mi.Bool, True, _lanes(tasks.count))
+        path, going, walk, trial = mi.UInt32(0), mi.Bool(True), _new_walk(), mi.UInt32(1)
+        while dr.hint(going, label="further trials"):
+            path, going = queue.next(path, idle)
+            vertex = tasks.at(path, going)
+            solved, ends, pattern, d = self._advance(walk, vertex, trial, going)
+            length, transmits = (
+                dr.gather(mi.UInt32, x, path, solved) for x in (found.length, found.transmits)
+            )
+            expected = dr.gather(mi.Vector3f, found.d, path, solved)
+            is_same = solved & (pattern == ((length << 2) | transmits))
+            is_same &= dr.squared_norm(d - expected) < _SAME**2
+            dr.scatter(result, trial, path, is_same)
+            finishes = is_same | (ends & (trial >= _MOST_TRIALS))
+            walk.steps = dr.select(ends, 0, walk.steps)
+            trial = dr.select(finishes, 1, trial + dr.select(ends, mi.UInt32(1), 0))
+            idle = finishes
+        return result
+
+    def _advance(
+        self, walk: NewtonWalk, vertex: Vertex, trial: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.Bool, mi.UInt32, mi.Vector3f]:
+        """Begins a trial or makes the next step. Returns whether it has found a chain, whether it
+        has ended, and length, pattern and first direction of the chain."""
+        begins = walk.steps == 0
+        new = self._seed(vertex, trial)
+        is_open = begins & new.is_open
+        walk.transmits = dr.select(begins, new.transmits, walk.transmits)
+        length = dr.select(begins, dr.select(is_open, vertex.most, 1), walk.length)
+        d = dr.select(begins, new.d, _turned(walk.d, walk.step, walk.share))
+        walk.error = dr.select(begins, dr.inf, walk.error)
+        walk.share = dr.select(begins, 1, walk.share)
+        ray = self._starts.along(vertex.si, d)
+        end = self._chains.trace(ray, length, walk.transmits, is_open, active)
+        walk.length = dr.select(begins, end.length, walk.length)
+        miss = missed(end, vertex.target)
+
+        # ----- Does it come closer? -----
+        better = active & miss.is_sound & (miss.error < walk.error)
+        walk.error = dr.select(better, miss.error, walk.error)
+        walk.d = dr.select(better, d, walk.d)
+        walk.step = dr.select(better, mi.Vector2f(miss.step_s, miss.step_t), walk.step)
+        turn = dr.norm(walk.step)
+        walk.share = dr.select(better, dr.minimum(1, 2 * walk.share), 0.5 * walk.share)
+        # A step of more than a radian leaves what the derivatives describe
+        walk.share = dr.minimum(walk.share, dr.rcp(turn))
+        walk.steps += 1
+        solved = better & (miss.error < _LEAST_ERROR) & (turn < _LEAST_TURN)
+        fails = (walk.steps >= _MOST_STEPS) | (walk.share < _LEAST_SHARE)
+        fails |= ~dr.isfinite(walk.error)
+        pattern = (end.length << 2) | (walk.transmits & ((1 << end.length) - 1))
+        return solved, active & (solved | fails), pattern, _turned(d, walk.step, mi.Float(1))
+
+
+def _lanes(paths: int) -> int:
+    """The number of lanes that take ``paths`` paths."""
+    return -(-paths // _PATHS_PER_LANE)
+
+
+def _new_walk() -> NewtonWalk:
+    walk = dr.zeros(NewtonWalk)
+    walk.error = mi.Float(dr.inf)
+    return walk
 
 
 def _turned(d: mi.Vector3f, step: mi.Vector2f, share: mi.Float) -> mi.Vector3f:
