@@ -52,16 +52,14 @@ class Casters:
     """The casters of a scene. Their normals and indices of refraction lie in tables, because a
     search for chains needs nothing else of a surface, and calls of shapes and BSDFs take longer.
 
+    Parameters:
+        shapes: The casters, at least one (:func:`casters_of`).
+
     Attributes:
-        exist: Whether there are any.
         refract: Whether some of them are glass.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
-        shapes = [shape for shape in scene.shapes() if _is_caster(shape)]
-        self.exist = bool(shapes)
-        if not shapes:
-            return
+    def __init__(self, shapes: list[mi.Shape]) -> None:
         transmits = int(mi.BSDFFlags.DeltaTransmission)
         self.refract = any(int(shape.bsdf().flags()) & transmits for shape in shapes)
         self._have_meshes = any(map(_has_triangles, shapes))
@@ -139,6 +137,11 @@ class Casters:
     def _entry(self, shape: mi.ShapePtr) -> mi.UInt32:
         index = dr.reinterpret_array(mi.UInt32, shape)
         return dr.gather(mi.UInt32, self._table, index, index < dr.width(self._table))
+
+
+def casters_of(scene: mi.Scene) -> list[mi.Shape]:
+    """The shapes of a scene that cast caustics."""
+    return [shape for shape in scene.shapes() if _is_caster(shape)]
 
 
 def _is_caster(shape: mi.Shape) -> bool:

@@ -28,6 +28,7 @@ class RayState:
         chance: Product of the probabilities with which the BSDFs sample these directions, or 1.
         length: The number of surfaces.
         is_sound: Whether there is such a chain.
+        first: The first point on a caster.
     """
 
     p: mi.Point3f
@@ -41,6 +42,7 @@ class RayState:
     chance: mi.Float
     length: mi.UInt32
     is_sound: mi.Bool
+    first: mi.Point3f
 
 
 class Chains:
@@ -71,6 +73,7 @@ class Chains:
             mi.Point3f(start.o), mi.Vector3f(start.d), mi.Point3f(start.o), mi.Vector3f(0),
             mi.Vector3f(0), mi.Vector3f(frame.s), mi.Vector3f(frame.t), mi.Spectrum(1),
             mi.Float(1), mi.UInt32(0), mi.Bool(active),
+            mi.Point3f(0),
         )
         going = mi.Bool(active) & (length > 0)
         while dr.hint(going, label="chain"):
@@ -118,6 +121,7 @@ class Chains:
             setattr(state, "d_" + i, dr.select(sound, e * dd + dμ * m + μ * dm, dd))
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n = point.p, geometric
+        state.first = dr.select(sound & (state.length == 0), point.p, state.first)
         state.p = dr.select(sound, point.p, state.p)
         state.d = dr.select(sound, out, state.d)
         state.o = dr.select(sound, self._query.starts.along(si, out).o, state.o)

@@ -23,6 +23,8 @@ from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertices
+from .seed_learner import ChainRecords
+from .seeds import SeedMap
 from .solver import Found, Queue, Seed, Solver, Target, Tasks, Vertex, missed
 
 #: The most surfaces of a chain: in and out of a piece of glass.
@@ -50,12 +52,13 @@ class ManifoldConnections:
     Parameters:
         query: How rays intersect the scene.
         max_depth: Longest path in segments.
+        seeds: Learned seeds.
     """
 
     def __init__(
-        self, scene: mi.Scene, query: SceneQuery, casters: Casters, max_depth: int
+        self, scene: mi.Scene, query: SceneQuery, casters: Casters, max_depth: int, seeds: SeedMap
     ) -> None:
-        self._scene, self._query, self._casters = scene, query, casters
+        self._scene, self._query, self._casters, self._seeds = scene, query, casters, seeds
         self._ctx = Heroes(scene).context()
         self._emission = LightEmission(scene)
         self._max_depth = dr.opaque(mi.UInt32, max_depth)
@@ -75,16 +78,18 @@ class ManifoldConnections:
     # ---- Connections ----
 
     def gather(
-        self, vertices: ChosenVertices, rays: CameraRays
-    ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """The radiance of one connection for each path, throughput included, and the number of
-        shadow rays.
+        self, vertices: ChosenVertices, rays: CameraRays, records: bool
+    ) -> tuple[mi.Spectrum, mi.UInt32, ChainRecords | None]:
+        """The radiance of one connection for each path, throughput included; the number of shadow
+        rays; and the chains, if they are recorded.
 
         Each step is a kernel of its own, with lanes only for paths for which there is something to
         do."""
         lane = dr.arange(mi.UInt32, dr.width(rays.ray))
         si, _β, depth, light, seed, active = self._chosen(vertices, rays, lane, mi.Bool(True))
-        tasks = Tasks(Vertex(si, self._target(light), seed, self.most_surfaces(depth)))
+        target = self._target(light)
+        leaf = self._seeds.leaf(si.p, target)
+        tasks = Tasks(Vertex(si, target, seed, self.most_surfaces(depth), leaf))
         searched = Queue(active & (light.probability > 0))
         dr.eval(tasks.words)
         found = self._solver.find(tasks, searched)
@@ -92,15 +97,22 @@ class ManifoldConnections:
         dr.eval(found)
         path, active = solved.all()
         of_path = dr.gather(Found, found, path, active)
-        L, tested = self._light_of(of_path, *self._chosen(vertices, rays, path, active))
+        L, tested, first = self._light_of(of_path, *self._chosen(vertices, rays, path, active))
         light_of_path = dr.zeros(mi.Spectrum, tasks.count)
         shadow_count = dr.zeros(mi.UInt32, tasks.count)
         dr.scatter(light_of_path, L, path, active)
         dr.scatter(shadow_count, dr.select(tested, mi.UInt32(1), 0), path, active)
-        dr.eval(light_of_path, shadow_count)
+        first_of_path = dr.zeros(mi.Point3f, tasks.count) if records else None
+        if records:
+            dr.scatter(first_of_path, first, path, active)
+        dr.eval(light_of_path, shadow_count, first_of_path)
         lit = Queue(dr.max(dr.abs(light_of_path)) > 0)
-        trials = self._solver.count(tasks, lit, found)
-        return light_of_path * mi.Float(trials), shadow_count
+        L = light_of_path * mi.Float(self._solver.count(tasks, lit, found))
+        if not records:
+            return L, shadow_count, None
+        pattern = (found.length << 2) | found.transmits
+        weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
+        return L, shadow_count, ChainRecords(si.p, target.p, first_of_path, pattern, weight)
 
     def _chosen(
         self, vertices: ChosenVertices, rays: CameraRays, path: mi.UInt32, active: mi.Bool
@@ -123,9 +135,9 @@ class ManifoldConnections:
     def _light_of(
         self, found: Found, si: mi.SurfaceInteraction3f, β: mi.Spectrum, depth: mi.UInt32,
         light: EmittedRay, seed: mi.UInt32, active: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Bool]:
-        """The radiance that chains bring, · the probability of finding them, and whether there was
-        a shadow ray."""
+    ) -> tuple[mi.Spectrum, mi.Bool, mi.Point3f]:
+        """The radiance that chains bring, · the probability of finding them; whether there was a
+        shadow ray; and the first point on a caster."""
         target = self._target(light)
         end = self._chains.trace(
             self._query.starts.along(si, found.d), found.length, found.transmits, mi.Bool(False),
@@ -144,7 +156,7 @@ class ManifoldConnections:
         L = β * value * end.weight * emitted * (miss.density * mis)
         tested = active & (dr.max(dr.abs(L)) > 0)
         visible = tested & ~self._scene.ray_test(_last_ray(end, target), active=tested)
-        return dr.select(visible, L, 0), tested
+        return dr.select(visible, L, 0), tested, end.first
 
     def _emitted(
         self, light: EmittedRay, end: RayState, active: mi.Bool
@@ -169,20 +181,27 @@ class ManifoldConnections:
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
 
     def _seed(self, vertex: Vertex, trial: mi.UInt32) -> Seed:
-        """Where a trial begins: towards a random point near a caster, or towards the light."""
+        """Where a trial begins: at a learned seed, towards a random point near a caster, or towards
+        the light."""
         si, target, seed = vertex.si, vertex.target, vertex.seed
         a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
         d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
-        if not self._casters.refract:
-            return Seed(d, mi.UInt32(0), mi.Bool(False))
-        straight = dr.select(
-            target.is_infinite, mi.Vector3f(target.p), dr.normalize(target.p - si.p)
-        )
-        refracts = c.x >= _REFLECTED
+        transmits, length, is_open = mi.UInt32(0), mi.UInt32(1), mi.Bool(False)
+        if self._casters.refract:
+            straight = dr.select(
+                target.is_infinite, mi.Vector3f(target.p), dr.normalize(target.p - si.p)
+            )
+            refracts = c.x >= _REFLECTED
+            d = dr.select(refracts & (c.y < _STRAIGHT), straight, d)
+            transmits = dr.select(refracts, mi.UInt32((1 << MOST_SURFACES) - 1), 0)
+            is_open = c.x >= _REFLECTED + _SINGLE * (1 - _REFLECTED)
+        first, pattern = self._seeds.seed(vertex.leaf, a.x, a.y)
+        learned = self._seeds.is_used(e.y)
         return Seed(
-            dr.select(refracts & (c.y < _STRAIGHT), straight, d),
-            dr.select(refracts, mi.UInt32((1 << MOST_SURFACES) - 1), 0),
-            c.x >= _REFLECTED + _SINGLE * (1 - _REFLECTED),
+            dr.select(learned, dr.normalize(first - si.p), d),
+            dr.select(learned, pattern & 3, transmits),
+            dr.select(learned, pattern >> 2, length),
+            ~learned & is_open,
         )
 
     # ---- Paths that scattering finds ----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from ....transport.path_program import PathProgram
 from ....transport.walk import Walk
 from .chosen_vertices import ChosenVertices
 from .connections import MOST_SURFACES, ManifoldConnections
+from .seed_learner import ChainRecords
 
 #: The number of surfaces of chains that no connection finds.
 _NEVER = 255
@@ -97,10 +99,12 @@ class ManifoldTracer:
     Parameters:
         walk: Traces the camera paths.
         connections: The connections.
+        record: Called with the chains of each pass; ``None`` if nothing learns from them.
     """
 
     walk: Walk
     connections: ManifoldConnections
+    record: Callable[[ChainRecords], None] | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
@@ -108,14 +112,18 @@ class ManifoldTracer:
         # Evaluated now, since several kernels read the rays
         dr.eval(rays)
         trace = _traced if self.walk.observer.can_be_frozen else _traced.__wrapped__
-        sample, place = trace(self, scene, sampler, rays, mi.Bool(active))
+        (sample, chains), place = trace(
+            replace(self, record=None), scene, sampler, rays, mi.Bool(active), self.record is not None
+        )
         go_to(sampler, place)
+        if self.record is not None:
+            self.record(chains)
         return sample
 
     def trace(
-        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
-    ) -> Sample:
-        """The samples of these rays."""
+        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool, records: bool
+    ) -> tuple[Sample, ChainRecords | None]:
+        """The samples of these rays, and their chains if they are recorded."""
         lanes = dr.width(rays.ray)
         vertices = self.connections.vertices(lanes)
         program = ManifoldProgram(self.connections, vertices, lanes)
@@ -123,15 +131,16 @@ class ManifoldTracer:
         sample, direct = walk.unclamped(scene, sampler, rays, active)
         vertices.schedule()
         dr.eval(sample, direct)
-        L, tested = self.connections.gather(vertices, rays)
+        L, tested, chains = self.connections.gather(vertices, rays, records)
         sample = replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
-        return walk.clamped(sample, direct)
+        return walk.clamped(sample, direct), chains
 
 
 @frozen
 def _traced(
-    tracer: ManifoldTracer, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
-) -> tuple[Sample, Any]:
-    """The samples of ``tracer``, and the position that the sampler has reached."""
+    tracer: ManifoldTracer, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool,
+    records: bool,
+) -> tuple[tuple[Sample, ChainRecords | None], Any]:
+    """The samples and chains of ``tracer``, and the position that the sampler has reached."""
     numbers = copied(sampler)
-    return tracer.trace(scene, numbers, rays, active), reached(numbers)
+    return tracer.trace(scene, numbers, rays, active, records), reached(numbers)

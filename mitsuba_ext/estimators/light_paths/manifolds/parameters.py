@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +14,11 @@ from ....transport.estimator import Estimator
 from ....transport.heroes import disperses
 from ....transport.queries.scene import scene_query
 from ....transport.walk import Walk
-from .casters import Casters
+from .casters import Casters, casters_of
 from .connections import ManifoldConnections
 from .manifold_tracer import ManifoldTracer
+from .seed_learner import ChainRecords, SeedLearner
+from .seeds import SeedMap
 
 #: The segments of the shortest path through a caster: to a surface, to the caster, to a light.
 _SHORTEST = 3
@@ -27,13 +30,15 @@ class ManifoldCaustics:
 
     Parameters (and attributes):
         connections: The connections.
+        record: Called with the chains of each pass; ``None`` if nothing learns from them.
     """
 
     connections: ManifoldConnections
+    record: Callable[[ChainRecords], None] | None = None
 
     def around(self, walk: Walk) -> Estimator:
         """``walk``, with these connections."""
-        return ManifoldTracer(walk, self.connections)
+        return ManifoldTracer(walk, self.connections, self.record)
 
 
 class Manifold(Technique):
@@ -46,6 +51,7 @@ class Manifold(Technique):
     #: Most scenes of docs/results/caustics.md take 3 to 8 times as long as with ``path``. A sample
     #: stores a vertex, a task and its result besides its ray.
     sample_cost, sample_bytes = 4, 256
+    pilot_spp = 16
 
     def check_together(self, plugin, slots):
         if "scattering" in slots:
@@ -54,24 +60,42 @@ class Manifold(Technique):
                 f'BSDFs only: leave "scattering" out ("direction_map" in "swarm_path")'
             )
 
-    def decision(self, setting: Setting) -> Any | None:
+    def can_learn(self, scene, spp):
+        return spp > 0 and not no_effect(scene)
+
+    def decision(self, setting):
+        if setting.pilot_spp > 0:
+            return None  # :meth:`learner` decides
+        make = self._maker(setting)
+        return None if make is None else make(SeedMap(), None)
+
+    def learner(self, setting, others):
+        make = self._maker(setting) if setting.pilot_spp > 0 else None
+        return None if make is None else SeedLearner(make)
+
+    def _maker(self, setting: Setting) -> Callable[[SeedMap, Any], ManifoldCaustics] | None:
+        """What makes the decision from seeds; ``None`` where nothing is connected."""
         scene = setting.scene
-        casters = Casters(scene)
-        if reason := no_effect(scene, setting.max_depth, casters):
+        if reason := no_effect(scene, setting.max_depth):
             what = f'"{setting.plugin}": the parameter "caustics" is "manifold", and has no effect'
             mi.Log(mi.LogLevel.Warn, f"{what}: {reason}")
             return None
-        connections = ManifoldConnections(scene, scene_query(scene), casters, setting.max_depth)
-        return ManifoldCaustics(connections)
+        query, depth = scene_query(scene), setting.max_depth
+        casters = Casters(casters_of(scene))
+
+        def make(seeds: SeedMap, record: Any) -> ManifoldCaustics:
+            return ManifoldCaustics(ManifoldConnections(scene, query, casters, depth, seeds), record)
+
+        return make
 
 
-def no_effect(scene: mi.Scene, max_depth: int, casters: Casters) -> str:
+def no_effect(scene: mi.Scene, max_depth: int = _SHORTEST) -> str:
     """Why nothing is connected through casters; empty if something is."""
     if not scene.emitters():
         return "the scene has no light"
     if max_depth < _SHORTEST:
         return f'"max_depth" is {max_depth}, and such paths have at least {_SHORTEST} segments'
-    if not casters.exist:
+    if not casters_of(scene):
         return (
             'no mesh, sphere, rectangle, disk or cylinder has a "dielectric" or "conductor" '
             "without bump, normal or opacity map"

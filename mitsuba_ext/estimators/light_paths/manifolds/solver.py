@@ -97,12 +97,14 @@ class Vertex:
         target: Where the chain should end.
         seed: The seed of the path's random numbers.
         most: The most surfaces of the chain.
+        leaf: The leaf of learned seeds.
     """
 
     si: mi.SurfaceInteraction3f
     target: Target
     seed: mi.UInt32
     most: mi.UInt32
+    leaf: mi.UInt32
 
 
 # Not a dataclass: loops only read it
@@ -111,17 +113,18 @@ class Tasks:
 
     Attributes:
         words: For each: the vertex (position and normal), the target, the seed of its random
-            numbers, and the longest chain, with a bit for lights at infinity.
+            numbers, the longest chain, with a bit for lights at infinity, and the leaf.
         count: Number of paths.
     """
 
-    _WORDS = 11
+    _WORDS = 12
     _INFINITE = 256
 
     def __init__(self, vertices: Vertex) -> None:
         v, self.count = vertices, dr.width(vertices.seed)
         mark = v.most | dr.select(v.target.is_infinite, mi.UInt32(self._INFINITE), 0)
         words = [*v.si.p, *v.si.n, *v.target.p, as_float(v.seed), as_float(mark)]
+        words.append(as_float(v.leaf))
         self.words = dr.empty(mi.Float, self.count * self._WORDS)
         dr.scatter(self.words, mi.ArrayXf(words), dr.arange(mi.UInt32, self.count))
 
@@ -131,9 +134,9 @@ class Tasks:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.p, si.n = mi.Point3f(w[0], w[1], w[2]), mi.Normal3f(w[3], w[4], w[5])
         si.wavelengths = some_wavelengths()
-        seed, mark = (dr.reinterpret_array(mi.UInt32, word) for word in (w[9], w[10]))
+        seed, mark, leaf = (dr.reinterpret_array(mi.UInt32, w[i]) for i in (9, 10, 11))
         target = Target(mi.Point3f(w[6], w[7], w[8]), (mark & self._INFINITE) != 0)
-        return Vertex(si, target, seed, mark & (self._INFINITE - 1))
+        return Vertex(si, target, seed, mark & (self._INFINITE - 1), leaf)
 
 
 @dataclass
@@ -143,11 +146,13 @@ class Seed:
     Attributes:
         d: The first direction.
         transmits: Bit i tells whether surface i of the chain transmits or reflects.
-        is_open: Whether the chain is as long as the casters that it meets; if not, it has one.
+        length: The number of surfaces.
+        is_open: Whether the chain is as long as the casters that it meets instead.
     """
 
     d: mi.Vector3f
     transmits: mi.UInt32
+    length: mi.UInt32
     is_open: mi.Bool
 
 
@@ -283,7 +288,8 @@ class Solver:
         new = self._seed(vertex, trial)
         is_open = begins & new.is_open
         walk.transmits = dr.select(begins, new.transmits, walk.transmits)
-        length = dr.select(begins, dr.select(is_open, vertex.most, 1), walk.length)
+        length = dr.select(is_open, vertex.most, dr.minimum(new.length, vertex.most))
+        length = dr.select(begins, length, walk.length)
         d = dr.select(begins, new.d, _turned(walk.d, walk.step, walk.share))
         walk.error = dr.select(begins, dr.inf, walk.error)
         walk.share = dr.select(begins, 1, walk.share)
