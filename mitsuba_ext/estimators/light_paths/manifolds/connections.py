@@ -35,10 +35,6 @@ MOST_SURFACES = 2
 #: of glass); and the fraction that begins straight towards the light.
 _REFLECTED, _SINGLE, _STRAIGHT = 0.25, 0.1, 0.5
 
-#: The probability of finding a chain that MIS weights assume. The true one is unknown where
-#: scattering has found the chain, and weights must agree.
-_ASSUMED_CHANCE = 0.1
-
 #: The numbers of hashes that no trial uses.
 _LIGHT_NUMBERS = 0xFFFF0000
 
@@ -88,7 +84,7 @@ class ManifoldConnections:
         lane = dr.arange(mi.UInt32, dr.width(rays.ray))
         si, _β, depth, light, seed, active = self._chosen(vertices, rays, lane, mi.Bool(True))
         target = self._target(light)
-        leaf = self._seeds.leaf(si.p, target)
+        leaf = self._seeds.leaf(si.p, target, active)
         tasks = Tasks(Vertex(si, target, seed, self.most_surfaces(depth), leaf))
         searched = Queue(active & (light.probability > 0))
         dr.eval(tasks.words)
@@ -107,12 +103,14 @@ class ManifoldConnections:
             dr.scatter(first_of_path, first, path, active)
         dr.eval(light_of_path, shadow_count, first_of_path)
         lit = Queue(dr.max(dr.abs(light_of_path)) > 0)
-        L = light_of_path * mi.Float(self._solver.count(tasks, lit, found))
+        trials = self._solver.count(tasks, lit, found)
+        L = light_of_path * mi.Float(trials)
         if not records:
             return L, shadow_count, None
         pattern = (found.length << 2) | found.transmits
         weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
-        return L, shadow_count, ChainRecords(si.p, target.p, first_of_path, pattern, weight)
+        chains = ChainRecords(si.p, target.p, first_of_path, pattern, weight, trials)
+        return L, shadow_count, chains
 
     def _chosen(
         self, vertices: ChosenVertices, rays: CameraRays, path: mi.UInt32, active: mi.Bool
@@ -139,9 +137,9 @@ class ManifoldConnections:
         """The radiance that chains bring, · the probability of finding them; whether there was a
         shadow ray; and the first point on a caster."""
         target = self._target(light)
+        start = self._query.starts.along(si, found.d)
         end = self._chains.trace(
-            self._query.starts.along(si, found.d), found.length, found.transmits, mi.Bool(False),
-            active, weighs=True,
+            start, found.length, found.transmits, mi.Bool(False), active, weighs=True
         )
         miss = missed(end, target)
         active &= miss.is_sound
@@ -150,7 +148,7 @@ class ManifoldConnections:
         by_us = light.probability * dr.select(
             light.is_infinite, light.pdf_direction, light.pdf_position
         )
-        by_us *= _ASSUMED_CHANCE
+        by_us *= self._seeds.chance(self._seeds.leaf(start.o, target, active))
         mis = power_heuristic(by_us, pdf * end.chance * miss.density * cosine)
         mis = dr.select(light.is_delta_position | light.is_delta_direction, 1, mis)
         L = β * value * end.weight * emitted * (miss.density * mis)
@@ -217,7 +215,8 @@ class ManifoldConnections:
         start.wavelengths = some_wavelengths()
         chain = self._chains.trace(start, h.length, h.transmits, mi.Bool(False), active)
         is_infinite = ~si.is_valid()
-        miss = missed(chain, Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite))
+        target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
+        miss = missed(chain, target)
         n = dr.select(is_infinite, mi.Normal3f(-ds.d), self._emission.front(si))
         # Lights at infinity: the density of directions does not depend on the point
         ref = mi.Interaction3f(path.arrival.ref)
@@ -226,7 +225,8 @@ class ManifoldConnections:
         )
         index = self._emission.index(ds.emitter, active)
         direction *= self._emission.chance(index, active)
-        by_us = _ASSUMED_CHANCE * dr.select(is_infinite, direction, position)
+        by_us = self._seeds.chance(self._seeds.leaf(h.o, target, active))
+        by_us *= dr.select(is_infinite, direction, position)
         by_scattering = h.pdf * miss.density
         by_scattering *= dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
         return dr.select(active & miss.is_sound, power_heuristic(by_scattering, by_us), 1)
