@@ -112,11 +112,11 @@ class ManifoldTracer:
         # Evaluated now, since several kernels read the rays
         dr.eval(rays)
         trace = _traced if self.walk.observer.can_be_frozen else _traced.__wrapped__
-        (sample, chains), place = trace(
-            replace(self, record=None), scene, sampler, rays, mi.Bool(active), self.record is not None
-        )
+        # Chains are recorded on the host, which a frozen function cannot do
+        tracer, records = replace(self, record=None), self.record is not None
+        (sample, chains), place = trace(tracer, scene, sampler, rays, mi.Bool(active), records)
         go_to(sampler, place)
-        if self.record is not None:
+        if records:
             self.record(chains)
         return sample
 

@@ -50,7 +50,7 @@ class Manifold(Technique):
     camera_paths_only, sees_media = True, False
     #: Most scenes of docs/results/caustics.md take 3 to 8 times as long as with ``path``. A sample
     #: stores a vertex, a task and its result besides its ray.
-    sample_cost, sample_bytes = 4, 256
+    sample_cost, sample_bytes = 4, 288
     pilot_spp = 16
 
     def check_together(self, plugin, slots):
@@ -84,7 +84,8 @@ class Manifold(Technique):
         casters = Casters(casters_of(scene))
 
         def make(seeds: SeedMap, record: Any) -> ManifoldCaustics:
-            return ManifoldCaustics(ManifoldConnections(scene, query, casters, depth, seeds), record)
+            connections = ManifoldConnections(scene, query, casters, depth, seeds)
+            return ManifoldCaustics(connections, record)
 
         return make
 

@@ -13,8 +13,11 @@ from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters, caster
 from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
 from mitsuba_ext.estimators.light_paths.manifolds.manifold_tracer import ManifoldTracer
 from mitsuba_ext.estimators.light_paths.manifolds.parameters import no_effect
+from mitsuba_ext.estimators.light_paths.manifolds.seeds import SeedMap
+from mitsuba_ext.estimators.light_paths.manifolds.solver import Target
 from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.transport.queries.scene import scene_query
+from mitsuba_ext.util.stored_arrays import DamagedError, StoredArrays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -151,13 +154,83 @@ def test_searches_may_begin_at_every_part_of_a_thin_caster() -> None:
     """Its table has no point near some of its parts: 1024 points on a strip 10 000 times as long
     as wide."""
     to_world = mi.ScalarTransform4f().scale([10, 0.001, 1])
-    casters = Casters(casters_of(_scene(strip={"type": "rectangle", "to_world": to_world, "bsdf": GLASS})))
+    strip = {"type": "rectangle", "to_world": to_world, "bsdf": GLASS}
+    casters = Casters(casters_of(_scene(strip=strip)))
     numbers = mi.load_dict({"type": "independent"})
     numbers.seed(1, 1 << 18)
     v = mi.Vector3f(*(numbers.next_1d() for _ in range(3)))
     x = np.array(casters.near(numbers.next_1d(), v, numbers.next_1d()).x)
     counts, _edges = np.histogram(x, 400, (-10, 10))
     assert (counts > 0).all()
+
+
+def _records(count: int) -> np.ndarray:
+    """Chains from vertices in a cube to one target. Each begins one unit above its vertex; the
+    chains of half of the vertices are twice as bright as the others."""
+    records = np.zeros((count, 12), np.float32)
+    records[:, 0:3] = np.random.default_rng(1).random((count, 3))
+    records[:, 6:9] = records[:, 0:3] + [0, 0, 1]
+    records[:, 9], records[:, 10] = 11, 4
+    records[:, 11] = np.where(records[:, 0] < 0.5, 2, 1)
+    return records
+
+
+def _seeds_at(seeds: SeedMap, p: mi.Point3f, height: float) -> mi.Point3f:
+    """Seeds for vertices; ``height`` is the number by which a node of the tree is chosen."""
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(1, dr.width(p))
+    target = Target(mi.Point3f(0), mi.Bool(False))
+    leaf = seeds.leaf(p, target, dr.full(mi.Bool, True, dr.width(p)))
+    first, pattern = seeds.seed(leaf, numbers.next_1d(), mi.Float(height))
+    assert dr.all(pattern == 11)
+    np.testing.assert_allclose(np.array(seeds.chance(leaf)), 1 / 7, rtol=1e-5)
+    return first - mi.Vector3f(0, 0, 1)
+
+
+def test_seeds_are_those_of_near_vertices_in_proportion_to_their_light() -> None:
+    records = _records(8192)
+    seeds = SeedMap.of(records)
+    p = mi.Point3f(np.ascontiguousarray(records[:, 0:3].T))
+    distance = np.array(dr.norm(_seeds_at(seeds, p, 0.0) - p))
+    assert distance.mean() < 0.12  # 512 leaves; of two random points: 0.66
+    # The root of the tree: the number is the largest one below 1
+    share = (np.array(_seeds_at(seeds, p, 1 - 2.0**-24).x) < 0.5).mean()
+    assert abs(share - 2 / 3) < 0.02
+
+
+def test_few_chains_are_enough_for_seeds() -> None:
+    seeds = SeedMap.of(_records(1))
+    assert len(seeds.seeds) == 1 and not len(seeds.splits)
+
+
+def test_seeds_are_restored() -> None:
+    seeds = SeedMap.of(_records(256))
+    stored = StoredArrays.of(seeds.state())
+    again = SeedMap.restored(stored)
+    for mine, other in zip(seeds.kernel_state(), again.kernel_state()):
+        np.testing.assert_array_equal(np.array(mine), np.array(other))
+    nothing = SeedMap.restored(StoredArrays.of(SeedMap().state()))
+    assert not len(nothing.seeds)
+    with pytest.raises(DamagedError, match="patterns"):
+        SeedMap.restored(StoredArrays.of({**seeds.state(), "seeds": seeds.seeds + 1}))
+
+
+def test_pilots_learn_seeds(tmp_path) -> None:
+    """A render that loads what another one has learned begins with its last stage."""
+    scene, file = _scene(**_statistical()["ball"]), str(tmp_path / "learned.npz")
+    integrator = mi.load_dict({
+        "type": "composed_path", "max_depth": 6, "caustics": "manifold", "save_learned": file,
+    })  # fmt: skip
+    mi.render(scene, integrator=integrator, spp=64)
+    assert "seeds of chains in" in integrator.statistics.learned
+    learned = integrator.learners["caustics"].state()
+    assert len(learned["seeds"]) > 1
+    again = mi.load_dict({
+        "type": "composed_path", "max_depth": 6, "caustics": "manifold", "load_learned": file,
+    })  # fmt: skip
+    assert np.isfinite(np.array(mi.render(scene, integrator=again, spp=4))).all()
+    for key, values in again.learners["caustics"].state().items():
+        np.testing.assert_array_equal(values, learned[key])
 
 
 def _statistical() -> dict[str, dict[str, Any]]:
