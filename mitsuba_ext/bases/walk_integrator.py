@@ -137,11 +137,6 @@ class WalkIntegrator(StagedIntegrator):
                     f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
                     f"integrators without light paths"
                 )
-        if self.has_expressions and (caustics := self.slots.get("caustics")):
-            raise NotImplementedError(
-                f'"{self.name}": the parameter "caustics" is "{caustics.name}", whose light is not '
-                f'divided among the light path expressions in "aovs": leave one of them out'
-            )
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             read = self.reader(props)

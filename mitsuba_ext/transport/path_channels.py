@@ -259,6 +259,36 @@ class PathChannels:
             found.append(mi.Spectrum(*(dr.select(p == 1, v, 0) for p, v in zip(parts, value))))
         return found
 
+    # ---- Along a chain of smooth surfaces ----
+
+    def specular(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
+        """The symbol of a smooth surface in a chain."""
+        return self._of_surface(shape, mi.UInt32(_SPECULAR), transmits)
+
+    def at_end(
+        self, vertex: Vertex, wo: mi.Vector3f, chain: Sequence[tuple[mi.UInt32, mi.Bool]],
+        emitter: mi.EmitterPtr, active: mi.Bool,
+    ) -> list[mi.UInt32]:
+        """The cells of a path that leaves ``vertex`` in the direction ``wo``, and is bent by smooth
+        surfaces until it ends in ``emitter``: see :meth:`add`.
+
+        Args:
+            chain: The symbol of each surface, and whether there is one.
+        """
+        kinds = self._chosen(vertex, wo, active)
+        states = self._behind(vertex, [self._symbol(vertex, wo, kind) for kind in kinds])
+        for symbol, exists in chain if self._reads else ():
+            states = [
+                dr.select(exists, dr.gather(mi.UInt32, self._next, s * self._symbols + symbol), s)
+                for s in states
+            ]
+        light = _looked_up(self._names, emitter)
+        return [dr.gather(mi.UInt32, self._ends, s * self._lights + light) for s in states]
+
+    def add(self, cells: list[mi.UInt32], value: mi.Spectrum) -> None:
+        """Adds the light of a path to its cells."""
+        self._add(cells, value, mi.Bool(True))
+
     # ---- Symbols ----
 
     def _gain(
@@ -321,11 +351,17 @@ class PathChannels:
         """The symbol of a vertex that scatters light between ``si.wi`` and ``wo``."""
         si = vertex.si
         transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
-        symbol = kind + dr.select(transmits, mi.UInt32(_KINDS), 0)
-        if self._surface_class is not None:
-            symbol += PER_CLASS * _looked_up(self._surface_class, si.shape)
+        symbol = self._of_surface(si.shape, kind, transmits)
         if vertex.medium is not None:
             symbol = dr.select(vertex.medium.scatters, mi.UInt32(VOLUME), symbol)
+        return symbol
+
+    def _of_surface(
+        self, shape: mi.ShapePtr, kind: mi.UInt32, transmits: mi.Bool
+    ) -> mi.UInt32:
+        symbol = kind + dr.select(transmits, mi.UInt32(_KINDS), 0)
+        if self._surface_class is not None:
+            symbol += PER_CLASS * _looked_up(self._surface_class, shape)
         return symbol
 
     # ---- States ----

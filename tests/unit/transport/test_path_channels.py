@@ -181,10 +181,9 @@ def test_integrators_that_do_not_know_the_events_refuse_expressions(name: str) -
         mi.load_dict({"type": name, "aovs": "c:caustics"})
 
 
-@pytest.mark.parametrize("more", [{"clamp_indirect": 1.0}, {"caustics": "manifold"}])
-def test_light_that_would_not_be_in_the_channels_is_refused(more) -> None:
+def test_light_that_would_not_be_in_the_channels_is_refused() -> None:
     with pytest.raises(RuntimeError, match="leave one of them out"):
-        mi.load_dict({"type": "composed_path", "aovs": "c:caustics", **more})
+        mi.load_dict({"type": "composed_path", "aovs": "c:caustics", "clamp_indirect": 1.0})
 
 
 def test_light_groups_need_to_be_named_where_the_scene_is_not_known() -> None:

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ....transport.bsdfs import sample_bsdf
+from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import SceneQuery
 from .casters import Casters
 
@@ -29,6 +30,7 @@ class RayState:
         length: The number of surfaces.
         is_sound: Whether there is such a chain.
         first: The first point on a caster.
+        turns: The symbols of its surfaces for light path expressions, 16 bits each.
     """
 
     p: mi.Point3f
@@ -43,6 +45,11 @@ class RayState:
     length: mi.UInt32
     is_sound: mi.Bool
     first: mi.Point3f
+    turns: mi.UInt32
+
+    def symbols(self) -> list[tuple[mi.UInt32, mi.Bool]]:
+        """The symbol of each surface, and whether there is one."""
+        return [((self.turns >> 16 * i) & 0xFFFF, self.length > i) for i in range(2)]
 
 
 class Chains:
@@ -61,19 +68,20 @@ class Chains:
     @dr.syntax
     def trace(
         self, start: mi.Ray3f, length: mi.UInt32, transmits: mi.UInt32, is_open: mi.Bool,
-        active: mi.Bool, weighs: bool = False,
+        active: mi.Bool, weighs: bool = False, channels: PathChannels | None = None,
     ) -> RayState:
         """The chain of ``length`` surfaces that begins with the ray ``start``. Bit i of
         ``transmits`` tells whether its surface i transmits or reflects. Where ``is_open``, the
         chain ends before the first surface that is no caster, and ``length`` is its longest
-        length. BSDFs are asked only if it ``weighs`` the chain."""
+        length. BSDFs are asked only if it ``weighs`` the chain, and symbols of light path
+        expressions found only for ``channels``."""
         frame = mi.Frame3f(start.d)
         ray = mi.Ray3f(start)
         state = RayState(
             mi.Point3f(start.o), mi.Vector3f(start.d), mi.Point3f(start.o), mi.Vector3f(0),
             mi.Vector3f(0), mi.Vector3f(frame.s), mi.Vector3f(frame.t), mi.Spectrum(1),
             mi.Float(1), mi.UInt32(0), mi.Bool(active),
-            mi.Point3f(0),
+            mi.Point3f(0), mi.UInt32(0),
         )
         going = mi.Bool(active) & (length > 0)
         while dr.hint(going, label="chain"):
@@ -82,6 +90,7 @@ class Chains:
             transmit = ((transmits >> state.length) & 1) == 1
             sound = self._bend(state, ray, pi, transmit, met)
             self._weigh(state, ray, pi, transmit, sound, weighs)
+            self._read(state, pi, transmit, channels)
             ends = is_open & ~met & (state.length > 0)
             state.is_sound &= ~going | sound | ends
             ray.o = dr.select(sound, state.o, ray.o)
@@ -142,6 +151,12 @@ class Chains:
         state.weight = dr.select(sound, state.weight * (weight * bs.pdf), state.weight)
         state.chance = dr.select(sound, state.chance * bs.pdf, state.chance)
         state.is_sound &= ~sound | agrees
+
+    def _read(self, state, pi, transmit, channels: PathChannels | None) -> None:
+        """Reads the symbol of the surface that ``state`` has met."""
+        if channels is not None:
+            symbol = channels.specular(pi.shape, transmit)
+            state.turns |= dr.select(state.length < 2, symbol << (16 * state.length), 0)
 
 
 def some_wavelengths() -> mi.Spectrum:

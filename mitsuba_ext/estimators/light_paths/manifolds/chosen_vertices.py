@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +20,27 @@ _BITS = 24
 _CHOICE = 0xFFFFFFFF
 
 
+@dataclass
+class ChosenVertex:
+    """The vertex of a path that is connected.
+
+    Attributes:
+        si: The interaction.
+        β: Throughput / probability of the choice.
+        depth: The depth.
+        seed: The seed of the random numbers of its connection.
+        exists: Whether there is any.
+        events: The states of light path expressions.
+    """
+
+    si: mi.SurfaceInteraction3f
+    β: mi.Spectrum
+    depth: mi.UInt32
+    seed: mi.UInt32
+    exists: mi.Bool
+    events: list[mi.UInt32]
+
+
 class ChosenVertices(Subpaths):
     """Chooses one vertex of each path in proportion to its throughput.
 
@@ -30,14 +52,16 @@ class ChosenVertices(Subpaths):
         lanes: Number of paths.
         most_surfaces: The most surfaces of a chain from a vertex at a depth.
         is_whole: Whether all fields of an interaction are stored.
+        events: The number of states that light path expressions keep of a path; 0 without any.
     """
 
     def __init__(
-        self, lanes: int, most_surfaces: Callable[[mi.UInt32], mi.UInt32], is_whole: bool
+        self, lanes: int, most_surfaces: Callable[[mi.UInt32], mi.UInt32], is_whole: bool,
+        events: int = 0,
     ) -> None:
-        self._lanes, self._most_surfaces, self._is_whole = lanes, most_surfaces, is_whole
+        self._most_surfaces, self._is_whole, self._events = most_surfaces, is_whole, events
         self._channels = dr.size_v(mi.Spectrum)
-        self._size = self._channels + 3 + interaction_words(is_whole)
+        self._size = self._channels + 3 + interaction_words(is_whole) + events
         self._words = dr.empty(mi.Float, lanes * self._size)
         self._totals = dr.zeros(mi.Float, lanes)
 
@@ -50,6 +74,7 @@ class ChosenVertices(Subpaths):
         taken = active & (hashed_2d(seed, mi.UInt32(_CHOICE)).x * total <= importance)
         words = [*vertex.path.β, importance, as_float(seed), as_float(vertex.depth)]
         words += to_words(vertex.si, self._is_whole)
+        words += [as_float(state) for state in vertex.path.events or ()]
         dr.scatter(self._words, mi.ArrayXf(words), h.lane, taken)
         dr.scatter(self._totals, total, h.lane, active)
         return mi.Spectrum(0), mi.UInt32(0)
@@ -66,9 +91,8 @@ class ChosenVertices(Subpaths):
 
     def load(
         self, path: mi.UInt32, active: mi.Bool
-    ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, mi.UInt32, mi.UInt32, mi.Bool]:
-        """The chosen vertex of a path: the interaction, the throughput / probability of the choice,
-        the depth, the seed of the random numbers of its connection, and whether there is any."""
+    ) -> ChosenVertex:
+        """The chosen vertex of a path."""
         total = dr.gather(mi.Float, self._totals, path, active)
         exists = active & (total > 0)
         shape = self._size, dr.width(path)
@@ -79,4 +103,6 @@ class ChosenVertices(Subpaths):
         )
         β *= dr.select(exists, total / importance, 0)
         seed, depth = (dr.reinterpret_array(mi.UInt32, word) for word in (seed, depth))
-        return from_words(words, self._is_whole), β, depth, seed, exists
+        events = [dr.reinterpret_array(mi.UInt32, w) for w in words[len(words) - self._events :]]
+        si = from_words(words[: len(words) - self._events], self._is_whole)
+        return ChosenVertex(si, β, depth, seed, exists, events)

@@ -8,6 +8,9 @@ weights leave out the probability of finding a chain, so that both sides can com
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TypeVar
+
 import drjit as dr
 import mitsuba as mi
 
@@ -16,16 +19,17 @@ from ....transport.estimator import CameraRays
 from ....transport.heroes import Heroes
 from ....transport.mis import power_heuristic
 from ....transport.numbers import hashed_2d
+from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import SceneQuery
-from ....transport.vertex import PathState
+from ....transport.vertex import PathState, Vertex
 from ..emission import EmittedRay, LightEmission
 from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
-from .chosen_vertices import ChosenVertices
+from .chosen_vertices import ChosenVertex, ChosenVertices
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
-from .solver import Found, Queue, Seed, Solver, Target, Tasks, Vertex, missed
+from .solver import Found, Queue, Search, Seed, Solver, Target, Tasks, missed
 
 #: The most surfaces of a chain: in and out of a piece of glass.
 MOST_SURFACES = 2
@@ -37,6 +41,25 @@ _REFLECTED, _SINGLE, _STRAIGHT = 0.25, 0.1, 0.5
 
 #: The numbers of hashes that no trial uses.
 _LIGHT_NUMBERS = 0xFFFF0000
+
+T = TypeVar("T")
+
+
+@dataclass
+class ChainLight:
+    """The light of a chain.
+
+    Attributes:
+        L: The radiance that it brings, throughput included, · the probability of finding it.
+        shadow_count: The number of shadow rays.
+        first: The first point on a caster.
+        cells: The cells of light path expressions.
+    """
+
+    L: mi.Spectrum
+    shadow_count: mi.UInt32
+    first: mi.Point3f
+    cells: list[mi.UInt32]
 
 
 class ManifoldConnections:
@@ -62,9 +85,10 @@ class ManifoldConnections:
         self._chains = Chains(scene, query, casters, self._ctx)
         self._solver = Solver(self._chains, query.starts, self._seed)
 
-    def vertices(self, lanes: int) -> ChosenVertices:
+    def vertices(self, lanes: int, channels: PathChannels | None) -> ChosenVertices:
         """What a pass with ``lanes`` paths stores, empty."""
-        return ChosenVertices(lanes, self.most_surfaces, self._is_whole)
+        events = 0 if channels is None else channels.colours
+        return ChosenVertices(lanes, self.most_surfaces, self._is_whole, events)
 
     def most_surfaces(self, depth: mi.UInt32) -> mi.UInt32:
         """The most surfaces of a chain that begins at a vertex at ``depth``."""
@@ -74,55 +98,58 @@ class ManifoldConnections:
     # ---- Connections ----
 
     def gather(
-        self, vertices: ChosenVertices, rays: CameraRays, records: bool
+        self, vertices: ChosenVertices, rays: CameraRays, channels: PathChannels | None,
+        records: bool,
     ) -> tuple[mi.Spectrum, mi.UInt32, ChainRecords | None]:
-        """The radiance of one connection for each path, throughput included; the number of shadow
-        rays; and the chains, if they are recorded.
+        """The radiance of one connection for each path, throughput included, which is added to
+        the channels of light path expressions; the number of shadow rays; and the chains, if they
+        are recorded.
 
         Each step is a kernel of its own, with lanes only for paths for which there is something to
         do."""
-        lane = dr.arange(mi.UInt32, dr.width(rays.ray))
-        si, _β, depth, light, seed, active = self._chosen(vertices, rays, lane, mi.Bool(True))
+        lanes = dr.arange(mi.UInt32, dr.width(rays.ray))
+        chosen, light = self._chosen(vertices, rays, lanes, mi.Bool(True))
         target = self._target(light)
-        leaf = self._seeds.leaf(si.p, target, active)
-        tasks = Tasks(Vertex(si, target, seed, self.most_surfaces(depth), leaf))
-        searched = Queue(active & (light.probability > 0))
+        leaf = self._seeds.leaf(chosen.si.p, target, chosen.exists)
+        most = self.most_surfaces(chosen.depth)
+        tasks = Tasks(Search(chosen.si, target, chosen.seed, most, leaf))
+        searched = Queue(chosen.exists & (light.probability > 0))
         dr.eval(tasks.words)
         found = self._solver.find(tasks, searched)
         solved = Queue(found.length > 0)
         dr.eval(found)
         path, active = solved.all()
-        of_path = dr.gather(Found, found, path, active)
-        L, tested, first = self._light_of(of_path, *self._chosen(vertices, rays, path, active))
-        light_of_path = dr.zeros(mi.Spectrum, tasks.count)
-        shadow_count = dr.zeros(mi.UInt32, tasks.count)
-        dr.scatter(light_of_path, L, path, active)
-        dr.scatter(shadow_count, dr.select(tested, mi.UInt32(1), 0), path, active)
-        first_of_path = dr.zeros(mi.Point3f, tasks.count) if records else None
-        if records:
-            dr.scatter(first_of_path, first, path, active)
-        dr.eval(light_of_path, shadow_count, first_of_path)
-        lit = Queue(dr.max(dr.abs(light_of_path)) > 0)
-        trials = self._solver.count(tasks, lit, found)
+        brought = self._light_of(
+            dr.gather(Found, found, path, active), *self._chosen(vertices, rays, path, active),
+            channels,
+        )  # fmt: skip
+        light_of_path, shadow_count, *cells = (
+            _of_paths(value, path, active, tasks.count)
+            for value in (brought.L, brought.shadow_count, *brought.cells)
+        )
+        first = _of_paths(brought.first, path, active, tasks.count) if records else None
+        dr.eval(light_of_path, shadow_count, cells, first)
+        trials = self._solver.count(tasks, Queue(dr.max(dr.abs(light_of_path)) > 0), found)
         L = light_of_path * mi.Float(trials)
+        if channels is not None:
+            channels.add(cells, L)
         if not records:
             return L, shadow_count, None
         pattern = (found.length << 2) | found.transmits
         weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
-        chains = ChainRecords(si.p, target.p, first_of_path, pattern, weight, trials)
+        chains = ChainRecords(chosen.si.p, target.p, first, pattern, weight, trials)
         return L, shadow_count, chains
 
     def _chosen(
         self, vertices: ChosenVertices, rays: CameraRays, path: mi.UInt32, active: mi.Bool
-    ) -> tuple:
-        """The chosen vertices of paths, as :meth:`ChosenVertices.load` returns them, and a point of
-        a light for each."""
-        si, β, depth, seed, active = vertices.load(path, active)
+    ) -> tuple[ChosenVertex, EmittedRay]:
+        """The chosen vertices of paths, and a point of a light for each."""
+        chosen = vertices.load(path, active)
+        si = chosen.si
         si.time = dr.gather(mi.Float, rays.ray.time, path, active)
         si.wavelengths = dr.gather(type(si.wavelengths), rays.ray.wavelengths, path, active)
-        numbers = _HashedNumbers(seed, mi.UInt32(_LIGHT_NUMBERS))
-        light = self._emission.sample(numbers, si.time, si.wavelengths, active)
-        return si, β, depth, light, seed, active
+        numbers = _HashedNumbers(chosen.seed, mi.UInt32(_LIGHT_NUMBERS))
+        return chosen, self._emission.sample(numbers, si.time, si.wavelengths, chosen.exists)
 
     def _target(self, light: EmittedRay) -> Target:
         return Target(
@@ -131,15 +158,16 @@ class ManifoldConnections:
         )
 
     def _light_of(
-        self, found: Found, si: mi.SurfaceInteraction3f, β: mi.Spectrum, depth: mi.UInt32,
-        light: EmittedRay, seed: mi.UInt32, active: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Bool, mi.Point3f]:
-        """The radiance that chains bring, · the probability of finding them; whether there was a
-        shadow ray; and the first point on a caster."""
+        self, found: Found, chosen: ChosenVertex, light: EmittedRay,
+        channels: PathChannels | None,
+    ) -> ChainLight:
+        """The light of chains."""
+        si, active = chosen.si, chosen.exists
         target = self._target(light)
         start = self._query.starts.along(si, found.d)
         end = self._chains.trace(
-            start, found.length, found.transmits, mi.Bool(False), active, weighs=True
+            start, found.length, found.transmits, mi.Bool(False), active, weighs=True,
+            channels=channels,
         )
         miss = missed(end, target)
         active &= miss.is_sound
@@ -151,10 +179,16 @@ class ManifoldConnections:
         by_us *= self._seeds.chance(self._seeds.leaf(start.o, target, active))
         mis = power_heuristic(by_us, pdf * end.chance * miss.density * cosine)
         mis = dr.select(light.is_delta_position | light.is_delta_direction, 1, mis)
-        L = β * value * end.weight * emitted * (miss.density * mis)
+        L = chosen.β * value * end.weight * emitted * (miss.density * mis)
         tested = active & (dr.max(dr.abs(L)) > 0)
         visible = tested & ~self._scene.ray_test(_last_ray(end, target), active=tested)
-        return dr.select(visible, L, 0), tested, end.first
+        cells = []
+        if channels is not None:
+            at = Vertex(si, si.bsdf(), PathState(*[None] * 6, events=chosen.events))
+            wo = si.to_local(found.d)
+            cells = channels.at_end(at, wo, end.symbols(), light.emitter, visible)
+        shadow_count = dr.select(tested, mi.UInt32(1), 0)
+        return ChainLight(dr.select(visible, L, 0), shadow_count, end.first, cells)
 
     def _emitted(
         self, light: EmittedRay, end: RayState, active: mi.Bool
@@ -178,10 +212,10 @@ class ManifoldConnections:
         # Its weight contains the density of the disk on which light paths begin
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
 
-    def _seed(self, vertex: Vertex, trial: mi.UInt32) -> Seed:
+    def _seed(self, search: Search, trial: mi.UInt32) -> Seed:
         """Where a trial begins: at a learned seed, towards a random point near a caster, or towards
         the light."""
-        si, target, seed = vertex.si, vertex.target, vertex.seed
+        si, target, seed = search.si, search.target, search.seed
         a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
         d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
         transmits, length, is_open = mi.UInt32(0), mi.UInt32(1), mi.Bool(False)
@@ -193,7 +227,7 @@ class ManifoldConnections:
             d = dr.select(refracts & (c.y < _STRAIGHT), straight, d)
             transmits = dr.select(refracts, mi.UInt32((1 << MOST_SURFACES) - 1), 0)
             is_open = c.x >= _REFLECTED + _SINGLE * (1 - _REFLECTED)
-        first, pattern = self._seeds.seed(vertex.leaf, a.x, a.y)
+        first, pattern = self._seeds.seed(search.leaf, a.x, a.y)
         learned = self._seeds.is_used(e.y)
         return Seed(
             dr.select(learned, dr.normalize(first - si.p), d),
@@ -252,6 +286,13 @@ class _HashedNumbers:
 
     def next_1d(self, active=True):
         return self.next_2d(active).x
+
+
+def _of_paths(value: T, path: mi.UInt32, active: mi.Bool, count: int) -> T:
+    """Values for some of ``count`` paths, and 0 for the others."""
+    result = dr.zeros(type(value), count)
+    dr.scatter(result, value, path, active)
+    return result
 
 
 def _last_ray(end: RayState, target: Target) -> mi.Ray3f:

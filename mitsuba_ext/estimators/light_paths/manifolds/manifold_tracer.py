@@ -125,14 +125,18 @@ class ManifoldTracer:
     ) -> tuple[Sample, ChainRecords | None]:
         """The samples of these rays, and their chains if they are recorded."""
         lanes = dr.width(rays.ray)
-        vertices = self.connections.vertices(lanes)
+        channels = self.walk.channels
+        vertices = self.connections.vertices(lanes, channels)
         program = ManifoldProgram(self.connections, vertices, lanes)
         walk = replace(self.walk, program=program)
         sample, direct = walk.unclamped(scene, sampler, rays, active)
         vertices.schedule()
         dr.eval(sample, direct)
-        L, tested, chains = self.connections.gather(vertices, rays, records)
+        L, tested, chains = self.connections.gather(vertices, rays, channels, records)
         sample = replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
+        if channels is not None:
+            dr.eval(sample)
+            sample.aovs = channels.values(rays)
         return walk.clamped(sample, direct), chains
 
 

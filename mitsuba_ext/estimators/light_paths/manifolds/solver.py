@@ -89,7 +89,7 @@ def missed(end: RayState, target: Target) -> Miss:
 
 
 @dataclass
-class Vertex:
+class Search:
     """From where a chain is searched for.
 
     Attributes:
@@ -120,23 +120,23 @@ class Tasks:
     _WORDS = 12
     _INFINITE = 256
 
-    def __init__(self, vertices: Vertex) -> None:
-        v, self.count = vertices, dr.width(vertices.seed)
+    def __init__(self, searches: Search) -> None:
+        v, self.count = searches, dr.width(searches.seed)
         mark = v.most | dr.select(v.target.is_infinite, mi.UInt32(self._INFINITE), 0)
         words = [*v.si.p, *v.si.n, *v.target.p, as_float(v.seed), as_float(mark)]
         words.append(as_float(v.leaf))
         self.words = dr.empty(mi.Float, self.count * self._WORDS)
         dr.scatter(self.words, mi.ArrayXf(words), dr.arange(mi.UInt32, self.count))
 
-    def at(self, path: mi.UInt32, active: mi.Bool) -> Vertex:
-        """The vertex of a path."""
+    def at(self, path: mi.UInt32, active: mi.Bool) -> Search:
+        """The search of a path."""
         w = dr.gather(mi.ArrayXf, self.words, path, active, shape=(self._WORDS, dr.width(path)))
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.p, si.n = mi.Point3f(w[0], w[1], w[2]), mi.Normal3f(w[3], w[4], w[5])
         si.wavelengths = some_wavelengths()
         seed, mark, leaf = (dr.reinterpret_array(mi.UInt32, w[i]) for i in (9, 10, 11))
         target = Target(mi.Point3f(w[6], w[7], w[8]), (mark & self._INFINITE) != 0)
-        return Vertex(si, target, seed, mark & (self._INFINITE - 1), leaf)
+        return Search(si, target, seed, mark & (self._INFINITE - 1), leaf)
 
 
 @dataclass
@@ -244,8 +244,8 @@ class Solver:
         path, going, walk = mi.UInt32(0), mi.Bool(True), _new_walk()
         while dr.hint(going, label="first trial"):
             path, going = queue.next(path, idle)
-            vertex = tasks.at(path, going)
-            solved, ends, pattern, d = self._advance(walk, vertex, mi.UInt32(0), going)
+            search = tasks.at(path, going)
+            solved, ends, pattern, d = self._advance(walk, search, mi.UInt32(0), going)
             for i in range(3):
                 dr.scatter(found_d, d[i], path + i * count, solved)
             dr.scatter(found_pattern, pattern, path, solved)
@@ -264,8 +264,8 @@ class Solver:
         path, going, walk, trial = mi.UInt32(0), mi.Bool(True), _new_walk(), mi.UInt32(1)
         while dr.hint(going, label="further trials"):
             path, going = queue.next(path, idle)
-            vertex = tasks.at(path, going)
-            solved, ends, pattern, d = self._advance(walk, vertex, trial, going)
+            search = tasks.at(path, going)
+            solved, ends, pattern, d = self._advance(walk, search, trial, going)
             length, transmits = (
                 dr.gather(mi.UInt32, x, path, solved) for x in (found.length, found.transmits)
             )
@@ -280,23 +280,23 @@ class Solver:
         return result
 
     def _advance(
-        self, walk: NewtonWalk, vertex: Vertex, trial: mi.UInt32, active: mi.Bool
+        self, walk: NewtonWalk, search: Search, trial: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Bool, mi.Bool, mi.UInt32, mi.Vector3f]:
         """Begins a trial or makes the next step. Returns whether it has found a chain, whether it
         has ended, and length, pattern and first direction of the chain."""
         begins = walk.steps == 0
-        new = self._seed(vertex, trial)
+        new = self._seed(search, trial)
         is_open = begins & new.is_open
         walk.transmits = dr.select(begins, new.transmits, walk.transmits)
-        length = dr.select(is_open, vertex.most, dr.minimum(new.length, vertex.most))
+        length = dr.select(is_open, search.most, dr.minimum(new.length, search.most))
         length = dr.select(begins, length, walk.length)
         d = dr.select(begins, new.d, _turned(walk.d, walk.step, walk.share))
         walk.error = dr.select(begins, dr.inf, walk.error)
         walk.share = dr.select(begins, 1, walk.share)
-        ray = self._starts.along(vertex.si, d)
+        ray = self._starts.along(search.si, d)
         end = self._chains.trace(ray, length, walk.transmits, is_open, active)
         walk.length = dr.select(begins, end.length, walk.length)
-        miss = missed(end, vertex.target)
+        miss = missed(end, search.target)
 
         # ----- Does it come closer? -----
         better = active & miss.is_sound & (miss.error < walk.error)

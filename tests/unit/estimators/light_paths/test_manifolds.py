@@ -351,6 +351,38 @@ def test_clamps_bound_the_light_of_connections_too() -> None:
     assert _render(scene, 1, **limits).mean(-1).max() < 2.01e-3
 
 
+def test_light_of_connections_is_in_the_channels_of_its_events() -> None:
+    """A floor with two lobes, and light that no camera path finds."""
+    metal = {"type": "roughconductor", "alpha": 0.3}
+    floor = {"type": "blendbsdf", "weight": 0.5, "a": GREY, "b": metal}
+    ball = {"type": "sphere", "id": "ball", "center": [0, 0, 0.6], "radius": 0.4, "bsdf": GLASS}
+    point = {"type": "point", "position": [0.3, 0.2, 2.0]}
+    scene = _scene(floor=_plane(0.0, floor), ball=ball, light=point)
+    aovs = "di:C<.D>.*L,gl:C<.[GS]>.*L,through:C<.[DG]><TS'ball'><TS'ball'>L,back:C<.D><RS>L"
+    image = _render(scene, 16, max_depth=4)
+    found = _render(scene, 16, max_depth=4, aovs=aovs)
+    diffuse, glossy, through, mirrored = (found[..., i : i + 3] for i in range(3, 15, 3))
+    np.testing.assert_array_equal(found[..., :3], image)
+    np.testing.assert_allclose(diffuse + glossy, image, rtol=1e-4, atol=1e-5)
+    for part in (diffuse, glossy, through, mirrored):
+        assert part.mean() > 1e-5
+    assert (through <= image + 1e-5).all() and (mirrored <= diffuse + 1e-5).all()
+
+
+@pytest.mark.slow
+def test_channels_hold_what_the_channels_of_path_hold() -> None:
+    scene = _scene(**_statistical()["ball"])
+    parameters = {"max_depth": 4, "aovs": "caustics:caustics,others:C.*D.?L"}
+    expected, found = (
+        np.array([
+            _render(scene, spp, seed, caustics=kind, **parameters)[..., 3:].mean((0, 1))
+            for seed in range(8)
+        ]) for kind, spp in (("scattered", 4096), ("manifold", 256))
+    )  # fmt: skip
+    error = np.hypot(found.std(0, ddof=1), expected.std(0, ddof=1)) / np.sqrt(8)
+    assert (abs(found.mean(0) - expected.mean(0)) < 4 * error).all()
+
+
 def test_timed_renders_begin_with_connections() -> None:
     """A first sample by a plain walk would not have the light of points through glass."""
     integrator = mi.load_dict({"type": "composed_path", "caustics": "manifold"})
