@@ -64,7 +64,7 @@ class SeedMap:
         self._nodes, self._leaves = from_numpy(mi.Float, nodes), from_numpy(mi.Float, leaves)
         self._chances = from_numpy(mi.Float, of_leaves)
         self._leaf_count = dr.opaque(mi.UInt32, len(splits) + 1)
-        self._share = dr.opaque(mi.Float, _SHARE if len(seeds) else 0)
+        self._share = dr.opaque(mi.Float, _SHARE if len(seeds) else 0.0)
 
     def kernel_state(self) -> tuple:
         """The attributes on which kernels depend (``frozen.py``)."""

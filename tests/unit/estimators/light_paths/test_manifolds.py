@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import drjit as dr
@@ -275,7 +276,8 @@ def test_points_and_directions_of_light_are_seen_as_bdpt_sees_them(light: dict[s
         light = {**light, "to_world": to_world}
     ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4, "bsdf": GLASS}
     scene = _scene(floor=_plane(0.0, GREY), ball=ball, light=light)
-    _compare(scene, {"type": "bdpt", "max_depth": 4}, 256, 4)
+    # Near focal lines, such light has no variance that is finite: many short renders are too dark
+    _compare(scene, {"type": "bdpt", "max_depth": 4}, 256, 4, 48)
 
 
 @pytest.mark.parametrize("preset", [
@@ -287,15 +289,17 @@ def test_presets_have_the_slot(preset: str) -> None:
     assert "caustics" not in mi.load_dict({"type": preset}).slots
 
 
-def _compare(scene: mi.Scene, reference: dict[str, Any], spp: int, depth: int) -> None:
+def _compare(
+    scene: mi.Scene, reference: dict[str, Any], spp: int, depth: int, renders: int = 16
+) -> None:
     means = []
     plugin = {"type": "composed_path", "caustics": "manifold", "max_depth": depth}
     for count, integrator in ((spp, mi.load_dict(reference)), (256, mi.load_dict(plugin))):
-        renders = [
+        found = [
             np.array(mi.render(scene, integrator=integrator, spp=count, seed=seed)).mean()
-            for seed in range(16)
+            for seed in range(renders)
         ]
-        means.append((np.mean(renders), np.std(renders, ddof=1) / 4))
+        means.append((np.mean(found), np.std(found, ddof=1) / np.sqrt(renders)))
     (expected, error), (found, own_error) = means
     assert abs(found - expected) < 4 * np.hypot(error, own_error)
     assert np.hypot(error, own_error) < 0.1 * expected
@@ -393,6 +397,7 @@ def test_timed_renders_begin_with_connections() -> None:
 def test_passes_are_recorded(monkeypatch) -> None:
     """Python traces the walk and the search for the first render, once for the pilots and once for
     the last stage."""
+    gc.collect()  # Dr.Jit records anew where objects of other scenes have gone since
     traced = []
     trace = ManifoldTracer.trace
     monkeypatch.setattr(ManifoldTracer, "trace", lambda *a: traced.append(1) or trace(*a))
