@@ -48,7 +48,7 @@ class Manifold(Technique):
     name = "manifold"
     slots, words = ("caustics",), {"manifold": {}}
     camera_paths_only, sees_media = True, False
-    #: Most scenes of docs/results/caustics.md take 3 to 8 times as long as with ``path``. A sample
+    #: Most scenes of docs/results/caustics.md take 3 to 6 times as long as with ``path``. A sample
     #: stores a vertex, a task and its result besides its ray.
     sample_cost, sample_bytes = 4, 288
     pilot_spp = 16
