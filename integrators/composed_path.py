@@ -87,12 +87,12 @@ class ComposedPath(WalkIntegrator):
          :monosp:`scattered`, only scattered rays find it, and they rarely hit a small light. With
          :monosp:`manifold`, one vertex of each path is also connected to a light through one
          reflection, or one or two refractions, by Newton's method. Pilots learn where such chains
-         begin. It takes 3 to 10 times as long as :monosp:`path` for a sample. The surfaces are meshes, spheres, rectangles, disks and
-         cylinders that have a :monosp:`dielectric` or :monosp:`conductor` without bump, normal or
-         opacity map; other surfaces, instances, and scenes that move or disperse light are left to
-         scattering. Light of points and directions that passes more than two surfaces is missing,
-         as with :monosp:`scattered`. It refuses participating media and
-         :monosp:`scattering=swarm`. (Default: scattered)
+         begin. A sample takes 3 to 10 times as long as with :monosp:`path`. The surfaces are
+         meshes, spheres, rectangles, disks and cylinders that have a :monosp:`dielectric` or
+         :monosp:`conductor` without bump, normal or opacity map; other surfaces, instances, and
+         scenes that move or disperse light are left to scattering. Light of points and directions
+         that passes more than two surfaces is missing, as with :monosp:`scattered`. It refuses
+         participating media and :monosp:`scattering=swarm`. (Default: scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ....scene.bsdfs import contains_bsdf
+from ....transport.bsdfs import sample_bsdf
 from ....transport.numbers import hashed_2d
 from ....util.arrays import from_numpy
 
@@ -191,7 +192,9 @@ def _eta(bsdf: mi.BSDF) -> float:
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = mi.Vector3f(0, 0, 1)
     si.wavelengths = mi.Spectrum(550) if mi.is_spectral else mi.Color0f()
-    bs, _weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(1), mi.Point2f(0.5), mi.Bool(True))
+    bs, _weight = sample_bsdf(
+        mi.BSDFPtr(bsdf), mi.BSDFContext(), si, mi.Float(1), mi.Point2f(0.5)
+    )
     return float(np.array(bs.eta).ravel()[0])
 
 
@@ -202,11 +205,8 @@ def _triangles(mesh: mi.Mesh) -> np.ndarray:
     words = np.zeros((len(faces), _TRIANGLE), np.float32)
     words[:, 0:3], words[:, 3:6] = p1 - p0, p2 - p0
     # The normal in the middle of each triangle, flipped as the mesh flips it
-    pi = dr.zeros(mi.PreliminaryIntersection3f, len(faces))
-    pi.t, pi.valid, pi.shape = mi.Float(1), mi.Bool(True), mi.ShapePtr(mesh)
-    pi.prim_uv, pi.prim_index = mi.Point2f(1 / 3), dr.arange(mi.UInt32, len(faces))
-    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    index = dr.arange(mi.UInt32, len(faces))
+    si = _interaction(mesh, mi.Point3f(0), index, mi.Point2f(1 / 3))
     middle = np.array(si.sh_frame.n).T
     words[:, 6:15] = np.tile(middle, 3)
     if mesh.has_vertex_normals():
@@ -230,10 +230,26 @@ def _points(shapes: list[mi.Shape]) -> mi.Float:
 
 
 def _some_points(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a shape, and their normals."""
+    """Points on a shape, and their normals. (In Mitsuba 3.9.1, the normals that rotated spheres
+    sample are not rotated: these normals are of intersections.)"""
     numbers = hashed_2d(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
-    ps = shape.sample_position(mi.Float(0), numbers)
-    return np.array(ps.p, np.float64).T, np.array(ps.n, np.float64).T
+    p = shape.sample_position(mi.Float(0), numbers).p
+    n = _interaction(shape, p, mi.UInt32(0), mi.Point2f(0.5)).n
+    n = dr.zeros(mi.Normal3f, _POINTS) + n  # a plane has one for all
+    return np.array(p, np.float64).T, np.array(n, np.float64).T
+
+
+def _interaction(
+    shape: mi.Shape, p: mi.Point3f, index: mi.UInt32, uv: mi.Point2f
+) -> mi.SurfaceInteraction3f:
+    """The interaction of a ray that meets a shape at ``p``; on meshes, at the coordinates ``uv`` of
+    a triangle."""
+    count = max(dr.width(p), dr.width(index))
+    pi = dr.zeros(mi.PreliminaryIntersection3f, count)
+    pi.t, pi.valid, pi.shape = mi.Float(1), mi.Bool(True), mi.ShapePtr(shape)
+    pi.prim_uv, pi.prim_index = uv, index
+    d = mi.Vector3f(0, 0, 1)
+    return pi.compute_surface_interaction(mi.Ray3f(p - d, d), mi.RayFlags.All)
 
 
 class NormalDerivative:

@@ -123,6 +123,34 @@ def test_derivatives_of_chains_are_those_of_finite_differences(kind: str, transm
             np.testing.assert_allclose(found, np.array(expected).ravel(), rtol=5e-3, atol=5e-3)
 
 
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("kind", ["sphere", "disk", "rectangle", "cylinder", "ply"])
+def test_tables_of_casters_hold_the_normals_of_mitsuba(kind: str, flip: bool, tmp_path) -> None:
+    rotate = mi.ScalarTransform4f().rotate([1 / 3, 2 / 3, 2 / 3], 40)
+    to_world = mi.ScalarTransform4f().translate([0.2, -0.1, 0.3]).scale(0.8) @ rotate
+    shape = {"type": kind, "to_world": to_world, "flip_normals": flip, "bsdf": GLASS}
+    if kind == "ply":
+        _wavy(True).write_ply(str(tmp_path / "wavy.ply"))
+        shape["filename"] = str(tmp_path / "wavy.ply")
+    scene = _scene(caster=shape)
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(1, 64)
+    origin = mi.Point3f(*(6 * numbers.next_1d() - 3 for _ in range(2)), 4)
+    aim = mi.Point3f(*(numbers.next_1d() - 0.5 for _ in range(3)))
+    ray = mi.Ray3f(origin, dr.normalize(aim - origin))
+    pi = scene.ray_intersect_preliminary(ray)
+    si = pi.compute_surface_interaction(ray)
+    hit = np.array(si.is_valid())
+    assert hit.sum() > 5
+    point, _change = Casters(casters_of(scene)).meet(pi, ray, si.is_valid())
+    for found, expected in ((point.p, si.p), (point.shading_normal, si.sh_frame.n)):
+        found, expected = (np.array(x)[:, hit] for x in (found, expected))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    along = np.array(abs(dr.dot(point.normal, si.n)))[hit]
+    np.testing.assert_allclose(along, 1, atol=1e-5)
+    np.testing.assert_allclose(np.array(point.eta)[hit], 1.5 / 1.000277, rtol=1e-6)  # in air
+
+
 def test_a_point_light_in_a_mirror_is_a_light_behind_it() -> None:
     """Its image is as bright as the light itself would be at the mirrored place."""
     camera = _camera([0, 0, 1.5], [0, 0, 0], fov=2.0)
