@@ -60,6 +60,7 @@ PICTURES = {
     "near_lights": 256,
     "fog": 1024,
     "volume_caustic": 256,
+    "tissue": 1024,
     "dunes": 256,
 }
 
@@ -81,7 +82,7 @@ INTEGRATORS = {
     "pool": "erpt",
     "keyhole": "auto",  # a denoiser keeps the spots of chains
     **dict.fromkeys(["water_glass", "mirrored_lamp"], "vcm"),
-    "volume_caustic": "sppm",
+    **dict.fromkeys(["volume_caustic", "tissue"], "sppm"),
     **dict.fromkeys(
         [
             "six_balls",
