@@ -155,6 +155,20 @@ class ComposedPRB(common.RBIntegrator):
     def to_string(self) -> str:
         return str(self.path)
 
+    @property
+    def learn_every(self) -> int:
+        """The parameter; 0 if no decision learns."""
+        return self.path.learn_every
+
+    @property
+    def learned(self) -> object:
+        """See :class:`RememberingPath`."""
+        return self.path.learned
+
+    def learns_within(self, renders: int) -> bool:
+        """See :class:`RememberingPath`."""
+        return self.path.learns_within(renders)
+
     def forget(self) -> None:
         """Learns again in the next render."""
         self.path.forget()

@@ -98,9 +98,18 @@ class RememberingPath(WalkIntegrator):
         return self.can_learn and bool(self._remembered) and self._remembered.scene.is_of(scene)
 
     @property
+    def learned(self) -> object:
+        """What the renders have learned: another object once they have learned again."""
+        return self._remembered
+
+    @property
     def is_due(self) -> bool:
         """Whether what it has learned is too old."""
-        return 0 < self.learn_every <= self._renders
+        return self.learns_within(1)
+
+    def learns_within(self, renders: int) -> bool:
+        """Whether what it has learned is too old for one of the next ``renders``."""
+        return 0 < self.learn_every < self._renders + renders
 
     def plan_learning(self, request, spp, kernels=math.inf):
         if self.is_due:
