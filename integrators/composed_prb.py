@@ -12,6 +12,7 @@ from mitsuba.ad.integrators import common
 from mitsuba_ext.bases.remembering_path import RememberingPath
 from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
+from mitsuba_ext.rendering.loss_samples import LossSamples
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import optimizes_grids, refuse_geometry
 from mitsuba_ext.scene.media import may_have_media
@@ -69,6 +70,12 @@ class ComposedPRB(common.RBIntegrator):
        - Number of renders of a scene after which the next one learns again, because materials and
          lights may have changed; 0 to learn only once. The parameter is accepted only if a decision
          learns. (Default: 16)
+     * - gradient_samples
+       - |string|
+       - Samples of the passes for gradients: :monosp:`even`, the same number in each pixel, or
+         :monosp:`loss`, more in pixels on whose values the loss depends most. With
+         :monosp:`loss`, pixels that a mask removes from the loss get none, and the others get
+         their samples. (Default: even)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. (Default: -1)
@@ -136,6 +143,10 @@ class ComposedPRB(common.RBIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         self.path, self._sensitive = (path(props) for path in self._paths)
+        samples = self.path.parameter(
+            props, "gradient_samples", "even", choices=("even", "loss")
+        )
+        self._follows_loss = samples == "loss"
         self._for_gradients = self.path
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
@@ -189,7 +200,24 @@ class ComposedPRB(common.RBIntegrator):
         sensor = find_sensor(scene, sensor)
         with in_turn(self, sensor):
             self._learn_for(scene, params, sensor, seed, spp)
-            super().render_backward(scene, params, grad_in, sensor, seed, spp)
+            if self._follows_loss:
+                with dr.suspend_grad():
+                    self._follow_loss(scene, grad_in, sensor, seed, spp)
+            else:
+                super().render_backward(scene, params, grad_in, sensor, seed, spp)
+
+    def _follow_loss(self, scene, grad_in, sensor, seed, spp) -> None:
+        sampler, spp = self.prepare(sensor, seed, spp)
+        samples = LossSamples(sensor, sampler, spp, grad_in, int(mi.UInt32(seed)[0]))
+        rays, δL = samples.rays, samples.derivatives()
+        *_, gathered = self.sample(
+            dr.ADMode.Primal, scene, sampler.clone(), rays.ray, pixel=rays.pixel
+        )
+        self.sample(
+            dr.ADMode.Backward, scene, sampler, rays.ray, δL=δL, state_in=gathered,
+            pixel=rays.pixel,
+        )  # fmt: skip
+        dr.eval()
 
     def _learn_for(self, scene, params, sensor, seed, spp) -> None:
         refuse_geometry(self.name, params)
@@ -202,9 +230,12 @@ class ComposedPRB(common.RBIntegrator):
         self._pixel_count, self._medium = width * height, sensor.get_medium()
         return super().prepare(sensor, seed, spp, list(aovs))
 
-    def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
-        lanes = dr.width(ray)
-        pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
+    def sample(
+        self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, pixel=None, **_others
+    ):
+        if pixel is None:
+            lanes = dr.width(ray)
+            pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
         rays = CameraRays(ray, pixel, medium=self._medium)
         walk = self._for_gradients.remembered(scene)
         if mode == dr.ADMode.Primal:

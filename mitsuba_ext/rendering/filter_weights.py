@@ -53,6 +53,8 @@ def _mean_weights(film: mi.Film) -> tuple[np.ndarray, np.ndarray]:
     integral = np.concatenate([[0], np.cumsum(values)]) * (edges[1] - edges[0])
 
     def along(size: int) -> np.ndarray:
+        if film.sample_border():
+            return np.full(size, integral[-1])
         centre = np.arange(size) + 0.5
         return np.interp(size - centre, edges, integral) - np.interp(-centre, edges, integral)
 

@@ -305,6 +305,7 @@ def composed_prb(
     save_learned: str = "",
     load_learned: str = "",
     learn_every: int = 16,
+    gradient_samples: str = "even",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -330,11 +331,34 @@ def composed_prb(
         save_learned, load_learned (string): As in composed_path. (Default: none)
         learn_every (int): Number of renders of a scene after which the next one learns again,
             because materials and lights may have changed; 0 to learn only once. (Default: 16)
+        gradient_samples (string): Samples of the passes for gradients: even, the same number in
+            each pixel, or loss, more in pixels on whose values the loss depends most. (Default:
+            even)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
         timeout (float): Seconds after which a render of the image (not of gradients) ends.
             (Default: -1, none)
+    """
+
+
+def control_variate(
+    *,
+    max_sensors: int = 64,
+    nested: Plugin = ...,
+    id: str = ...,
+) -> dict[str, Any]:
+    """Recursive control variates (control_variate).
+
+    Makes the images of an optimization less noisy, and with them its gradients: the image of the
+    last step is corrected by the difference of two renders, before and after the parameters
+    changed, which have the same random numbers and hence almost the same noise. For use with
+    mi.render(scene, params, integrator=…), around an integrator that computes gradients.
+
+    Parameters:
+        max_sensors (int): Most sensors whose last images are kept. (Default: 64)
+        (Nested plugin) (integrator): The integrator to render with, exactly one: composed_prb, prb,
+            prbvolpath, direct_projective, or another one that computes gradients.
     """
 
 

@@ -17,7 +17,7 @@ LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith(
 #: Some integrators have no depth of their own: they nest another one.
 LOAD_ALL = """
 WRAPPERS = (
-    "adaptive", "ecoc_dof", "variance", "reweighted_lens", "reweighted_time",
+    "adaptive", "control_variate", "ecoc_dof", "variance", "reweighted_lens", "reweighted_time",
     "reweighted_wavelength",
 )
 

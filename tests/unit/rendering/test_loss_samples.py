@@ -1,0 +1,137 @@
+"""Gradients of ``composed_prb`` from more samples where the loss depends on the image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.stage import area, film, rectangle, rgb, sensor, stage
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ENDS = (
+    "floor.bsdf.reflectance.value", "metal.bsdf.alpha.value", "lamp.emitter.radiance.value"
+)  # fmt: skip
+
+
+def room(**of_film: Any) -> mi.Scene:
+    T = mi.ScalarTransform4f
+    metal = {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": rgb(0.6, 0.7, 0.8)}
+    return mi.load_dict(
+        stage(
+            camera=sensor(film=film(16, 12, **of_film)),
+            metal={"type": "sphere", "center": [-0.5, 0.2, 0.5], "radius": 0.4, "bsdf": metal},
+            lamp=rectangle(T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180).scale(0.3),
+                           emitter=area(8.0)),
+        ),
+        optimize=False,
+    )  # fmt: skip
+
+
+def integrator(name: str = "composed_prb", **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": name, "max_depth": 3, **parameters})
+
+
+def gradients(
+    scene: mi.Scene, by: mi.Integrator, derivative: np.ndarray, seed: int, spp: int = 16
+) -> np.ndarray:
+    """The sum over the channels of each parameter's gradient."""
+    parameters = mi.traverse(scene)
+    keys = [next(k for k in parameters.keys() if k.endswith(end)) for end in ENDS]
+    for key in keys:
+        dr.enable_grad(parameters[key])
+        dr.set_grad(parameters[key], 0)
+    parameters.update()
+    by.render_backward(scene, parameters, mi.TensorXf(derivative), seed=seed, spp=spp)
+    found = [np.array(dr.grad(parameters[key])).sum() for key in keys]
+    dr.disable_grad([parameters[key] for key in keys])
+    return np.array(found)
+
+
+def loss_of(scene: mi.Scene, mask: bool = True) -> np.ndarray:
+    """The derivative of a loss that depends on a part of the image, unevenly."""
+    height, width = scene.sensors()[0].film().crop_size()[::-1]
+    weights = np.random.default_rng(3).uniform(-0.5, 1.5, (height, width, 3)) ** 3
+    if mask:
+        weights[: height // 2] = weights[:, : width // 4] = 0
+    return (weights / weights.size).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "of_film",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"rfilter": {"type": "gaussian"}}, marks=pytest.mark.slow),
+        pytest.param({"rfilter": {"type": "tent"}, "sample_border": True}, marks=pytest.mark.slow),
+        {"crop_width": 9, "crop_height": 8, "crop_offset_x": 3, "crop_offset_y": 4,
+         "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"},
+    ],
+    ids=["box", "gaussian", "border", "crop"],
+)  # fmt: skip
+def test_the_expected_gradient_does_not_change(of_film: dict[str, Any]) -> None:
+    scene = room(**of_film)
+    derivative = loss_of(scene)
+    if of_film.get("pixel_format") == "luminance":
+        derivative = derivative[..., :1].copy()
+    ours, theirs = (
+        np.array([gradients(scene, by, derivative, seed) for seed in seeds])
+        for by, seeds in (
+            (integrator(gradient_samples="loss"), range(12)),
+            (integrator("prb"), range(100, 112)),
+        )
+    )
+    variances = [each.var(axis=0, ddof=1) for each in (ours, theirs)]
+    error = np.sqrt(sum(variances) / 12)
+    z = (ours.mean(axis=0) - theirs.mean(axis=0)) / error
+    assert np.abs(z).max() < 4.5, z
+    precision = error / np.abs(theirs.mean(axis=0))
+    assert precision[0] < 0.03 and precision[2] < 0.05
+    if not of_film:  # and more than half of the pixels have no effect
+        assert np.mean(np.log(variances[0] / variances[1])) < np.log(0.8)
+
+
+def test_without_an_effect_the_gradient_is_zero() -> None:
+    scene, by = room(), integrator(gradient_samples="loss")
+    derivative = np.zeros_like(loss_of(scene))
+    assert (gradients(scene, by, derivative, 1) == 0).all()
+    # With "prb", too, pixels whose derivative is not a number have no gradient
+    derivative[8, 8] = np.nan
+    assert (gradients(scene, by, derivative, 1) == 0).all()
+    assert "gradient_samples = loss" in str(by)
+    with pytest.raises(RuntimeError, match="must be one of even, loss"):
+        integrator(gradient_samples="x")
+
+
+def test_samples_are_where_the_loss_is() -> None:
+    """A single pixel gets all of them: the gradient of many samples from few."""
+    scene = room()
+    derivative = np.zeros_like(loss_of(scene))
+    derivative[9, 5] = 1
+    few = gradients(scene, integrator(gradient_samples="loss"), derivative, 1, spp=16)
+    many = gradients(scene, integrator(), derivative, 2, spp=16 * derivative[..., 0].size)
+    np.testing.assert_allclose(few[0], many[0], rtol=0.1)
+
+
+def test_image_and_gradient_need_numbers_of_their_own() -> None:
+    """The gradient of a squared error is a product of the image and its derivative. With the same
+    random numbers, it contains their covariance."""
+    scene, by = room(), integrator()
+    target = np.array(by.render(scene, seed=10**6, spp=256)) * 0.9
+
+    def of_loss(image: mi.TensorXf, seed: int, spp: int) -> float:
+        derivative = (2 * (np.array(image) - target) / target.size).astype(np.float32)
+        return float(gradients(scene, by, derivative, seed, spp)[0])
+
+    def several(offset: int) -> tuple[float, float]:
+        found = [of_loss(by.render(scene, seed=s, spp=1), s + offset, 1) for s in range(24)]
+        # Few seeds have most of the variance: medians
+        spread = np.median(np.abs(found - np.median(found)))
+        return float(np.median(found)), float(spread)
+
+    exact = of_loss(by.render(scene, seed=10**6 + 1, spp=256), 1, 256)
+    (own, error), (shared, _) = several(1000), several(0)
+    assert abs(own - exact) < error < (shared - exact) / 3, (own, shared, exact, error)
