@@ -14,7 +14,7 @@ from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.loss_samples import LossSamples
 from mitsuba_ext.rendering.turns import in_turn
-from mitsuba_ext.scene.gradients import optimizes_grids, refuse_geometry
+from mitsuba_ext.scene.gradients import optimized_but_smooth, optimizes_grids, refuse_geometry
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
@@ -94,9 +94,9 @@ class ComposedPRB(common.RBIntegrator):
     derivatives), and parameters of phase functions. **Not when** you optimize the position or shape
     of objects, or the camera (use :monosp:`prb` or :monosp:`prb_projective`): these are refused,
     and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth glass have no
-    gradients, nor has the opacity of masks where light passes. Gradients of exactly black colours,
-    of an albedo of 0, and of a homogeneous extinction of 0 lack the light that scattered rays would
-    have found.
+    gradients (a warning names them), nor has the opacity of masks where light passes. Gradients of
+    exactly black colours, of an albedo of 0, and of a homogeneous extinction of 0 lack the light
+    that scattered rays would have found.
 
     The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
@@ -152,6 +152,7 @@ class ComposedPRB(common.RBIntegrator):
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
         self._pixel_count, self._medium, self._fills_gaps = 1, None, False
+        self._optimized: frozenset[str] = frozenset()
 
     @property
     def statistics(self):
@@ -221,9 +222,24 @@ class ComposedPRB(common.RBIntegrator):
 
     def _learn_for(self, scene, params, sensor, seed, spp) -> None:
         refuse_geometry(self.name, params)
+        self._tell_of_zeros(scene, params)
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
         self._fills_gaps = optimizes_grids(scene)
+
+    def _tell_of_zeros(self, scene, params) -> None:
+        """Warns of gradients that are always 0, once for each set of parameters."""
+        items = params.items() if hasattr(params, "items") else ()
+        optimized = frozenset(str(key) for key, value in items if dr.grad_enabled(value))
+        if optimized == self._optimized:
+            return
+        self._optimized = optimized
+        if smooth := optimized_but_smooth(scene):
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'"{self.name}": mirrors and smooth glass have no gradients: they are 0 for the '
+                f"BSDFs {', '.join(smooth)}. Rough BSDFs have some.",
+            )
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())

@@ -17,8 +17,9 @@ from mitsuba_ext.startup import registry
 from mitsuba_ext.util.parameters import read_parameter
 
 
+# Not a CppADIntegrator: "aov" and "moment" would call its sample(). They refuse this one.
 @registry.plugin
-class ControlVariate(mi.CppADIntegrator):
+class ControlVariate(mi.AdjointIntegrator):
     r"""
     .. _integrator-control_variate:
 

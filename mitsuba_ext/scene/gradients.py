@@ -13,8 +13,9 @@ from .media import scene_media
 from .parameter_values import values_of
 
 #: Parameters of shapes and sensors that change where rays hit.
-_GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "x_fov", "principal_point_offset_x",
-             "principal_point_offset_y")  # fmt: skip
+_GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "control_points", "x_fov",
+             "principal_point_offset_x", "principal_point_offset_y", "aperture_radius",
+             "focus_distance")  # fmt: skip
 
 
 def refuse_geometry(plugin: str, params: Any) -> None:
@@ -49,6 +50,19 @@ def optimizes_grids(scene: mi.Scene) -> bool:
         for medium in scene_media(scene)
         if not medium.is_homogeneous()
         for key, value in values_of(mi.traverse(medium))
+    )
+
+
+def optimized_but_smooth(scene: mi.Scene) -> list[str]:
+    """The names of the BSDFs whose parameters have gradients, although all of their light is
+    reflected or refracted as by mirrors and smooth glass. Their gradients are 0."""
+    bsdfs = {bsdf.ptr: bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
+    return sorted(
+        bsdf.id()
+        for bsdf in bsdfs.values()
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        and _is_optimized(bsdf)
     )
 
 

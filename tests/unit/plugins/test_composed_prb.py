@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.util.errors import one_line
-from tests.support.stage import area, bitmap, diffuse, rectangle, rgb, stage
+from tests.support.stage import (
+    area,
+    bitmap,
+    diffuse,
+    film,
+    lookat,
+    rectangle,
+    rgb,
+    sensor,
+    stage,
+)
 from tests.support.statistical import load
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -105,6 +115,52 @@ def test_with_all_defaults_gradients_agree_with_prb(more: dict[str, Any]) -> Non
         scale = np.abs(expected).max()
         assert scale > 0, key
         np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.005 * scale, err_msg=key)
+
+
+def _crop() -> dict[str, Any]:
+    return sensor(film=film(16, 12, crop_width=8, crop_height=6, crop_offset_x=3, crop_offset_y=4))
+
+
+def _batch() -> dict[str, Any]:
+    other = lookat([1, -4, 1.2], [0, 0, 0.6], [0, 0, 1])
+    return {"type": "batch", "film": film(16, 8), "sampler": {"type": "independent"},
+            "left": sensor(film=film(8, 8)), "right": sensor(to_world=other, film=film(8, 8))}
+
+
+@pytest.mark.parametrize("camera, moment", [(_crop, False), (_batch, False), (sensor, True)])
+def test_crop_windows_batches_and_moments_have_gradients(camera: Any, moment: bool) -> None:
+    scene = mi.load_dict(stage(camera=camera()), optimize=False)
+    parameters = mi.traverse(scene)
+    key = next(key for key in parameters.keys() if key.endswith("floor.bsdf.reflectance.value"))
+    found = []
+    for name in ("composed_prb", "prb"):
+        plugin = {"type": name, "max_depth": 3}
+        integrator = mi.load_dict({"type": "moment", "nested": plugin} if moment else plugin)
+        dr.enable_grad(parameters[key])
+        dr.set_grad(parameters[key], 0)
+        parameters.update()
+        image = mi.render(scene, parameters, integrator=integrator, seed=2, spp=16)
+        dr.backward(dr.mean(image[..., -3:]))
+        found.append(dr.grad(parameters[key]).numpy())
+    assert (found[0] > 0).all()
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
+
+
+def test_a_warning_names_the_mirrors_that_are_optimized(capfd) -> None:
+    mirror = {"type": "conductor", "specular_reflectance": rgb(0.9), "id": "looking-glass"}
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": mirror}
+    scene = mi.load_dict(stage(ball=ball), optimize=False)
+    parameters = mi.traverse(scene)
+    integrator = make()
+    for end, count in (("floor.bsdf.reflectance.value", 0), ("specular_reflectance.value", 1)):
+        key = next(key for key in parameters.keys() if key.endswith(end))
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        for seed in range(2):
+            image = mi.render(scene, parameters, integrator=integrator, seed=seed, spp=1)
+            dr.backward(dr.mean(image))
+        said = capfd.readouterr()
+        assert (said.out + said.err).count("0 for the BSDFs looking-glass") == count
 
 
 LEARNED = (

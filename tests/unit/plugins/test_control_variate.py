@@ -69,7 +69,7 @@ def test_images_of_a_changing_scene_are_unbiased_and_less_noisy() -> None:
     path, integrator = mi.load_dict(plain()), wrapped()
     colours = [0.3 * 1.05**step for step in range(8)]
     runs, single = [], []
-    for run in range(40):
+    for run in range(24):
         integrator.forget()
         for step, colour in enumerate(colours):
             parameters[key] = mi.Color3f(colour)
@@ -244,6 +244,7 @@ def test_what_cannot_work_is_refused() -> None:
         ({"a": plain(), "max_sensors": 0}, '"max_sensors" is 0'),
         ({"a": plain(), "spp": 4}, 'no parameter "spp"'),
         ({"a": plain("neepp", checkpoint="a")}, "checkpoint"),
+        ({"type": "moment", "a": {"type": "control_variate", "b": plain()}}, "SamplingIntegrator"),
     ):
         with pytest.raises(RuntimeError) as error:
             mi.load_dict({"type": "control_variate", **parameters})
