@@ -58,8 +58,12 @@ class Optimization:
         auto = mi.load_dict({"type": "auto", "max_depth": 6})
         self.target = mi.render(self.scene, integrator=auto, spp=512)
         self.parameters = mi.traverse(self.scene)
-        keys = [k for k in self.parameters.keys() if k.endswith("reflectance.value")]
-        self.truth = {key: mi.Color3f(self.parameters[key]) for key in keys}
+        # No grey values, which are floats
+        self.truth = {
+            key: mi.Color3f(value)
+            for key, value in self.parameters
+            if key.endswith("reflectance.value") and isinstance(value, mi.Color3f)
+        }
         dr.eval(self.target, self.truth)
         self._start = start
 
