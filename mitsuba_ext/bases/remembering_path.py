@@ -99,8 +99,9 @@ class RememberingPath(WalkIntegrator):
 
     @property
     def learned(self) -> object:
-        """What the renders have learned: another object once they have learned again."""
-        return self._remembered
+        """What the renders have learned: another object once they have learned again, ``None`` if
+        no decision learns."""
+        return self._remembered if self.can_learn else None
 
     @property
     def is_due(self) -> bool:

@@ -163,6 +163,7 @@ def test_a_step_that_is_interrupted_is_forgotten(monkeypatch: pytest.MonkeyPatch
     scene, integrator = small(), wrapped(plain("composed_prb"))
     for seed in range(2):
         integrator.render(scene, seed=seed, spp=1)
+    assert integrator.weight.numpy().max() == 0.5
 
     def interrupt(*_arguments: Any) -> None:
         raise KeyboardInterrupt
