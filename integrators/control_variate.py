@@ -44,8 +44,8 @@ class ControlVariate(mi.AdjointIntegrator):
 
     **Use it when** you optimize with few samples in each step, and parameters change by a few
     percent. **Not when** noise does not matter, or parameters change a lot from step to step: each
-    step renders the image twice (which takes a quarter to a third of the time of a step with
-    gradients). A single image gains nothing.
+    step renders the image twice, so that a step with gradients takes up to a third more time. A
+    single image gains nothing.
 
     **The image.** Step i renders the scene with the random numbers that step i-1 has announced, and
     with those of the next step. With :math:`f_i` and :math:`h_{i+1}`, its image is
@@ -62,7 +62,7 @@ class ControlVariate(mi.AdjointIntegrator):
     **Sensors.** Each sensor has an image of its own, so that several can take turns; a film that
     changes its size or crop window, another number of samples or another scene begins anew.
     :monosp:`forget()` begins anew with all sensors. A sensor that moves has no gain, and no bias.
-    What is kept of a sensor takes 28 bytes for each pixel and channel.
+    What is kept of a sensor takes 32 bytes for each pixel and channel.
 
     **Random numbers.** The first step uses the :monosp:`seed` of :monosp:`mi.render`. Each step
     derives the seed of the next one from its own :monosp:`seed`, so that equal loops give equal

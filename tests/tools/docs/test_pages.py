@@ -45,7 +45,7 @@ VALUES = {
     "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
     "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,
-    "threshold": 0.2, "visibility": "primary", "reallocated": 0.5,
+    "threshold": 0.2, "visibility": "primary", "reallocated": 0.5, "gradient_samples": "loss",
     **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage", "blue_noise"], True),
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
