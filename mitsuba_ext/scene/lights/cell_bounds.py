@@ -22,6 +22,10 @@ _FAR, _AROUND = 1e3, 10.0
 #: radius: the means of both cosines are what one estimates inside of a cluster.
 _INSIDE = 0.3
 
+#: The part of the light of an environment for which connections are wanted: walls see half of it,
+#: and scattered rays find half of that. (Unlike small lights, they hit it wherever it is visible.)
+_SEEN = 0.25
+
 
 def cell_bounds(scene: mi.Scene, cells: LightCells, power: np.ndarray) -> tuple[Lights, np.ndarray]:
     """What the cells of a scene look like from afar. Directional lights are points far away,
@@ -106,7 +110,7 @@ class _CellBounds:
             # Irradiance of a surface in uniform light
             irradiance = self.strength[cell] / (4 * area)
             distance = self.spread[cell] = self.reach[cell] = _AROUND * radius
-            self.strength[cell] = irradiance * distance**2 / _INSIDE
+            self.strength[cell] = _SEEN * irradiance * distance**2 / _INSIDE
             return
         distance = _FAR * radius
         self.center[cell] = self._scene_center - distance * direction

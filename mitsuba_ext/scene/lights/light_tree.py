@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...util.arrays import from_numpy
-from .tree_construction import MOST_CHILDREN, NODE_WORDS, Trees
+from .tree_construction import NODE_WORDS, Trees
 
 #: The squared spread of lights, times this, is added to their squared distance: a mean of 1 / d².
 _SPREAD = 0.5
@@ -76,14 +76,12 @@ class LightTree:
             The light, and the probability of choosing it.
         """
         x, level, probability = mi.Float(numbers.x), mi.UInt32(0), mi.Float(1)
-        estimates = dr.alloc_local(mi.Float, MOST_CHILDREN)
         link = dr.gather(mi.UInt32, self._link, root, active)
         goes_down = active & (link & 1 == 0)
         while dr.hint(goes_down, label="light tree"):
             x = dr.select(level == self._half, numbers.y, x)
             first, count = link >> 6, (link >> 1 & 31) + 1
-            total, estimates = self._estimates(first, count, p, receiver, estimates, goes_down)
-            child, share, x = _pick(count, total, estimates, x, goes_down)
+            child, share, x = self._pick(first, count, p, receiver, x, goes_down)
             probability *= share
             level += 1
             link = dr.gather(mi.UInt32, self._link, first + child, goes_down)
@@ -91,15 +89,36 @@ class LightTree:
         return link >> 1, probability
 
     @dr.syntax
-    def _estimates(self, first, count, p, receiver, estimates, active):
-        """The estimates of siblings, and their sum."""
-        total, index = mi.Float(0), mi.UInt32(0)
-        while dr.hint(active & (index < count), label="estimates"):
+    def _pick(self, first, count, p, receiver, x, active):
+        """Picks one of ``count`` siblings, the first of which is ``first``, by the uniform number
+        ``x``. Each sibling in turn takes the place of the one before it with the probability of its
+        share in the sum so far.
+
+        Returns:
+            The sibling's place among them, its probability, and what is left of the number.
+        """
+        rest, total, mine = mi.Float(x), mi.Float(0), mi.Float(0)
+        child, index = mi.UInt32(0), mi.UInt32(0)
+        while dr.hint(active & (index < count), label="siblings"):
             estimate = self._estimate(first + index, p, receiver, active)
-            estimates.write(estimate, index, active)
-            total += estimate
+            before, total = total, total + estimate
+            target = rest * total
+            is_lit = estimate > 0
+            is_taken = is_lit & ((target < estimate) | (before <= 0))
+            child = dr.select(is_taken, index, child)
+            mine = dr.select(is_taken, estimate, mine)
+            # What is left of the number is uniform again
+            target -= dr.select(is_taken, 0, estimate)
+            target /= dr.select(is_taken, estimate, dr.maximum(before, _TINY))
+            rest = dr.select(is_lit, target, rest)
+            rest = dr.clip(rest, 0, dr.one_minus_epsilon(mi.Float))
             index += 1
-        return total, estimates
+        # Where all are dark
+        is_dark, slots = total <= 0, mi.Float(count)
+        slot = dr.minimum(mi.UInt32(x * slots), count - 1)
+        child = dr.select(is_dark, slot, child)
+        rest = dr.select(is_dark, x * slots - mi.Float(slot), rest)
+        return child, _share(mine, total, count), rest
 
     @dr.syntax
     def probability(self, light: mi.UInt32, p: mi.Point3f, receiver: Receiver, active) -> mi.Float:
@@ -112,7 +131,7 @@ class LightTree:
             first, count = link >> 6, (link >> 1 & 31) + 1
             # In the order of `choose`, for the same sum
             total, mine, index = mi.Float(0), mi.Float(0), mi.UInt32(0)
-            while dr.hint(index < count, label="siblings"):
+            while dr.hint(index < count, label="its siblings"):
                 estimate = self._estimate(first + index, p, receiver, active)
                 total += estimate
                 mine = dr.select(first + index == node, estimate, mine)
@@ -138,52 +157,31 @@ class LightTree:
         height = dr.dot(normal, d)
         is_lit = ~is_opaque | (height * ratio + spread >= 0)
         height = dr.select(is_opaque, height, dr.abs(height)) * inverse
-        received = _mean_of_positive(height, 0.5 * near) + _LEAST_COSINE
+        near_2 = 0.25 * dr.square(near)
+        received = _mean_of_positive(height, near_2) + _LEAST_COSINE
         if self._in_media:
             received = dr.select(dr.squared_norm(normal) > 0, received, 1)
 
         height, length_2 = -dr.dot(axis, d), dr.squared_norm(axis)
         # A mean normal of length 1 is the normal of all lights. If it is 0, they face all sides
         variety = 0.25 * dr.maximum(1 - length_2, 0)
-        emitted = _mean_of_positive(
-            height * inverse, dr.sqrt(variety + dr.square(0.5 * near))
-        )
-        # The distance from the cone's mantle, times the axis's length, positive within the cone
-        aside = dr.safe_sqrt(length_2 * d_2 - dr.square(height))
+        emitted = _mean_of_positive(height * inverse, variety + near_2)
+        # Is a point within the lights' reach of the vertex in the cone? It is if height · sin +
+        # reach · length >= aside · cos, where `aside` is the distance from the axis, times its
+        # length. Without roots: squares of both sides, and (1 + length²) / 2, which is no less
+        aside_2 = dr.maximum(length_2 * d_2 - dr.square(height), 0)
         sin_limit = dr.safe_sqrt(1 - dr.square(cos_limit))
-        within = height * sin_limit - aside * cos_limit
-        is_lit &= within * ratio + spread * dr.sqrt(length_2) >= 0
+        inside = height * sin_limit * ratio + spread * 0.5 * (1 + length_2)
+        outside_2 = aside_2 * dr.square(cos_limit * ratio)
+        is_wide, inside_2 = cos_limit <= 0, dr.square(inside)
+        is_lit &= dr.select(
+            inside >= 0, is_wide | (inside_2 >= outside_2), is_wide & (inside_2 <= outside_2)
+        )
 
         G = received * emitted * dr.square(inverse)
         if self._largest is not None:
             G = dr.minimum(G, self._largest)
         return dr.select(is_lit, strength * G, 0)
-
-
-@dr.syntax
-def _pick(count, total, estimates, x, active) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-    """Picks one of ``count`` siblings by the uniform number ``x``.
-
-    Returns:
-        The sibling, the probability of picking it, and what is left of the random number.
-    """
-    target, child, before = x * total, mi.UInt32(0), mi.Float(0)
-    estimate = estimates.read(child, active)
-    # Only by rounding can the sum of all stay below the target: then the last one is picked
-    while dr.hint(
-        active & (before + estimate <= target) & (child + 1 < count), label="child"
-    ):
-        before += estimate
-        child += 1
-        estimate = estimates.read(child, active)
-    # Where all are dark
-    is_dark = total <= 0
-    slots = mi.Float(count)
-    slot = dr.minimum(mi.UInt32(x * slots), count - 1)
-    child = dr.select(is_dark, slot, child)
-    left = dr.select(is_dark, x * slots - mi.Float(slot), (target - before) / estimate)
-    left = dr.clip(dr.select(estimate > 0, left, 0.5), 0, dr.one_minus_epsilon(mi.Float))
-    return child, _share(estimate, total, count), left
 
 
 def _share(estimate, total, count) -> mi.Float:
@@ -195,6 +193,6 @@ def _last_bits(x: mi.Float) -> mi.Float:
     return mi.Float(dr.reinterpret_array(mi.UInt32, x) & 0xFF)
 
 
-def _mean_of_positive(mean: mi.Float, deviation: mi.Float) -> mi.Float:
-    """An estimate of the mean of max(x, 0), if x has this mean and varies by this deviation."""
-    return 0.5 * (mean + dr.sqrt(dr.square(mean) + dr.square(deviation)))
+def _mean_of_positive(mean: mi.Float, variance: mi.Float) -> mi.Float:
+    """An estimate of the mean of max(x, 0), if x has this mean and this variance."""
+    return 0.5 * (mean + dr.sqrt(dr.square(mean) + variance))
