@@ -176,7 +176,7 @@ class Auto(LightPathIntegrator):
         is_short &= not (self.target_of(request) or self.keep_learned)
         plan = super().plan_learning(request, 0 if is_short else spp, kernels)
         if is_short and plan.restore is None:
-            remark = f"nothing: with fewer than {least} samples, it is path"
+            remark = f"nothing: there are fewer than {least} samples"
             plan = replace(plan, remark=remark)
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
@@ -208,7 +208,7 @@ class Auto(LightPathIntegrator):
         return choice.estimator(self.walk(decisions, observer), mapper)
 
     def parameters(self):
-        learns_from = f"{self._least_samples()} samples (with fewer, it is path)"
+        learns_from = f"{self._least_samples()} samples"
         return {**super().parameters(), "learns_from": learns_from}
 
     def _least_samples(self) -> int:

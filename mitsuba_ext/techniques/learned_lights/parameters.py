@@ -10,6 +10,7 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Slots, Technique
 from ...rendering.camera import film_extent
+from ...transport.tree_choice import tree_choice
 from .learner import LightMapLearner
 
 #: What the map of :class:`LearnedLights` can learn of each light, the default first.
@@ -17,8 +18,8 @@ TARGETS = ("contribution", "visibility")
 
 
 class LearnedLights(Technique):
-    """Chooses lights by what the pilots' samples found. The attributes are the parameters of the
-    plugin ``learned_lights``; see there.
+    """Chooses lights by what the pilots' samples found; without pilots, by a light tree. The
+    attributes are the parameters of the plugin ``learned_lights``; see there.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.
@@ -36,6 +37,11 @@ class LearnedLights(Technique):
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         return spp > 0 and bool(scene.emitters()) and bool(scene.shapes())
+
+    def decision(self, setting: Setting) -> Any | None:
+        if self.can_learn(setting.scene, setting.pilot_spp):
+            return None
+        return tree_choice(setting.scene)
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         if not self.can_learn(setting.scene, setting.pilot_spp):

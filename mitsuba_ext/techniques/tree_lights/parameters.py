@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ...planning.technique import Setting, Technique
-from .tree_lights import tree_choice
+from ...transport.tree_choice import tree_choice
 
 
 class TreeLights(Technique):

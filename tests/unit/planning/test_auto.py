@@ -12,6 +12,7 @@ from mitsuba_ext.estimators.light_paths.choice import light_paths
 from mitsuba_ext.planning import planner, verdicts
 from tests.support.emitters_and_materials import EMITTERS, below_the_lamp
 from tests.support.fogs import fog
+from tests.support.light_choices import mixed_lights
 from tests.support.stage import stage
 from tests.support.statistical import (
     MANY_SEEDS,
@@ -42,9 +43,20 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
     return integrator.statistics.learned
 
 
-def test_a_render_that_is_too_short_to_learn_says_that_it_is_path() -> None:
-    assert learned(stage(), 4) == "nothing: with fewer than 262144 samples, it is path"
-    assert "262144 samples (with fewer, it is path)" in str(auto())
+def test_a_render_that_is_too_short_to_learn_says_so() -> None:
+    assert learned(stage(), 4) == "nothing: there are fewer than 262144 samples"
+    assert "learns_from = 262144 samples" in str(auto())
+
+
+def test_a_render_that_is_too_short_to_learn_has_a_light_tree() -> None:
+    scene = mi.load_dict(mixed_lights())
+    tree = {"type": "composed_path", "max_depth": 6, "next_event": "tree"}
+    others = ({"type": name, "max_depth": 6} for name in ("auto", "auto_path", "neepp"))
+    expected, *images = (
+        np.array(mi.load_dict(made).render(scene, spp=1, seed=1)) for made in (tree, *others)
+    )
+    for image in images:
+        np.testing.assert_array_equal(image, expected)
 
 
 def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.scene.lights.light_cells import LightCells
-from mitsuba_ext.techniques.tree_lights.tree_lights import TreeChoice, tree_choice
+from mitsuba_ext.transport.tree_choice import TreeChoice, tree_choice
 from tests.support.light_choices import (
     LANES,
     assert_density_fits,

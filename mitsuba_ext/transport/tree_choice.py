@@ -6,16 +6,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...scene.bsdfs import is_in_table, opaque_bsdfs
-from ...scene.lights.cell_bounds import cell_bounds
-from ...scene.lights.light_cells import LightCells
-from ...scene.lights.light_tree import LightTree, Receiver
-from ...scene.lights.tree_construction import build_trees
-from ...scene.lights.weights import power_weights
-from ...scene.media import may_have_media
-from ...transport.light_table import if_active
-from ...transport.path_decisions import EmitterSampling
-from ...util.arrays import from_numpy
+from ..scene.bsdfs import is_in_table, opaque_bsdfs
+from ..scene.lights.cell_bounds import cell_bounds
+from ..scene.lights.light_cells import LightCells
+from ..scene.lights.light_tree import LightTree, Receiver
+from ..scene.lights.tree_construction import build_trees
+from ..scene.lights.weights import power_weights
+from ..scene.media import may_have_media
+from ..util.arrays import from_numpy
+from .light_table import if_active
+from .path_decisions import EmitterSampling
 
 #: Meshes of more faces than this are divided into about as many cells.
 _FACE_CELLS = 1 << 16
