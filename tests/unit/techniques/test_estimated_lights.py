@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.techniques.linear_lights.linear_lights import LinearChoice
-from mitsuba_ext.transport.tree_choice import tree_choice
 from mitsuba_ext.transport.path_decisions import EmitterSampling
+from mitsuba_ext.transport.tree_choice import tree_choice
 from tests.support.light_choices import LANES, counts_at, floor, point, select, vertex_at
 from tests.support.stage import diffuse
 
