@@ -12,6 +12,10 @@ from __future__ import annotations
 #: time, except in showroom, where paths with the table take 0.88 of the time.)
 SEGMENT, SHADOW, TABLE = 1.35, 0.5, 0.05
 
+#: The time of a sample with a light tree, relative to ``path``, less the time with a table (0.0 to
+#: 0.1 in eight scenes of ``many_lights.py``).
+TREE = 0.05
+
 #: The time of partial sums along a segment of a camera path, of a segment of a light path, of a
 #: connection of each vertex, and of its shadow ray. With merging: of a vertex that is put into the
 #: grid, and of a vertex or cell that is looked at. (A fit to seven sets of techniques without

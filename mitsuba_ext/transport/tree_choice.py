@@ -8,13 +8,14 @@ import numpy as np
 
 from ..scene.bsdfs import is_in_table, opaque_bsdfs
 from ..scene.lights.cell_bounds import cell_bounds
+from ..scene.lights.choice import Choice
 from ..scene.lights.light_cells import LightCells
 from ..scene.lights.light_tree import LightTree, Receiver
 from ..scene.lights.tree_construction import build_trees
 from ..scene.lights.weights import power_weights
 from ..scene.media import may_have_media
 from ..util.arrays import from_numpy
-from .light_table import if_active
+from .light_table import Rows, if_active
 from .path_decisions import EmitterSampling
 
 #: Meshes of more faces than this are divided into about as many cells.
@@ -32,12 +33,13 @@ class TreeChoice(EmitterSampling):
     Parameters:
         scene: A scene with at least two cells.
         cells: Its cells.
+        rows: The rows of places in which observers count choices, if there are any.
     """
 
     choice_dimension = 2
 
-    def __init__(self, scene: mi.Scene, cells: LightCells) -> None:
-        self.cells = cells
+    def __init__(self, scene: mi.Scene, cells: LightCells, rows: Rows | None = None) -> None:
+        self.cells, self._rows = cells, rows
         weights = power_weights(scene, cells).numpy().astype(np.float64)
         chosen = np.flatnonzero(weights > 0)
         if len(chosen) == 0:
@@ -68,7 +70,10 @@ class TreeChoice(EmitterSampling):
         cell = dr.gather(mi.UInt32, self._cell_of, light, active)
         ds, weight = self.cells.sample(cell, si, numbers.point, active)
         ds.pdf *= probability
-        return ds, dr.select(probability > 0, weight / probability, 0), None
+        choice = None
+        if self._rows is not None:
+            choice = Choice(self._rows.row(si, active), cell, probability)
+        return ds, dr.select(probability > 0, weight / probability, 0), choice
 
     def density(self, state, scene, ref, si, ds, active):
         # Few rays hit a light: the others skip the way up the tree

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...util.arrays import from_numpy
+from ...util.spectra import comparison_wavelengths
 from ..bounds import scene_bounds
 from ..movers import is_moving_light
 from .division import emitter_shapes, triangles
@@ -43,11 +45,17 @@ def cell_bounds(scene: mi.Scene, cells: LightCells, power: np.ndarray) -> tuple[
     sphere = box.bounding_sphere() if has_extent else mi.ScalarBoundingSphere3f(0.0, 1.0)
     bounds = _CellBounds(cells.count, np.array(sphere.center), float(sphere.radius) or 1.0, power)
     shapes, emitters = emitter_shapes(scene), scene.emitters()
+    is_part = np.bincount(cells.emitter_index, minlength=len(emitters))[cells.emitter_index] > 1
     meshes = [i for i, s in enumerate(shapes) if s is not None and _is_flat(emitters[i], s)]
+    if cells.has_face_cells:
+        is_part &= np.isin(cells.emitter_index, meshes, invert=True)
+    meshes = np.setdiff1d(meshes, cells.emitter_index[is_part]).astype(int)
     bounds.faces(
         [shapes[i] for i in meshes], [cells.faces(i, shapes[i].face_count()) for i in meshes]
     )
-    others = np.isin(cells.emitter_index, meshes, invert=True)
+    if is_part.any():
+        bounds.parts(cells, shapes, np.flatnonzero(is_part))
+    others = np.isin(cells.emitter_index, meshes, invert=True) & ~is_part
     for cell in np.flatnonzero(others):
         i = cells.emitter_index[cell]
         bounds.emitter(cell, emitters[i], shapes[i])
@@ -68,6 +76,11 @@ def _axis(emitter: mi.Emitter) -> np.ndarray:
     """The direction in which an emitter shines: the z axis of its own space."""
     axis = _vector(emitter.world_transform() @ mi.Vector3f(0, 0, 1))
     return axis / max(np.linalg.norm(axis), 1e-300)
+
+
+#: The number of points of a part of a light; and the steps of a sequence of points (R. Roberts,
+#: *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
+_POINTS, _GOLDEN = 16, np.array([0.7548776662466927, 0.5698402909980532])
 
 
 class _CellBounds:
@@ -181,6 +194,52 @@ class _CellBounds:
         angle = np.zeros(count)
         np.maximum.at(angle, cell[has_area], np.arccos(np.clip(cosine, -1, 1)) + 0.5 * np.pi)
         self.angle[mine] = np.where(length > 1e-3, np.minimum(angle, np.pi), np.pi)[mine]
+
+    def parts(
+        self, cells: LightCells, shapes: list[mi.Shape | None], index: np.ndarray
+    ) -> None:
+        """Parts of lights, and the bins of an environment: means over points of each of them.
+        ``index``: their cells."""
+        lane = np.arange(len(index) * _POINTS)
+        numbers = ((0.5 + lane[None] * _GOLDEN[:, None]) % 1).astype(np.float32)
+        ref = dr.zeros(mi.SurfaceInteraction3f, len(lane))
+        ref.p = mi.Point3f(self._scene_center)
+        ref.wavelengths = comparison_wavelengths(len(lane))
+        cell = from_numpy(mi.UInt32, np.repeat(index, _POINTS))
+        numbers = mi.Point2f(*(from_numpy(mi.Float, x) for x in numbers))
+        ds, _weight = cells.sample(cell, ref, numbers, mi.Bool(True))
+        p, n, d = (mi.Vector3f(x) + dr.zeros(mi.Vector3f, len(lane)) for x in (ds.p, ds.n, ds.d))
+        dr.eval(p, n, d)
+        p, n, d = (
+            x.numpy().T.reshape(len(index), _POINTS, 3).astype(np.float64) for x in (p, n, d)
+        )
+        is_bin = index >= cells.first_bin
+        self._bins(cells, index[is_bin], d[is_bin])
+        index, p, n = index[~is_bin], p[~is_bin], n[~is_bin]
+        self.center[index] = center = p.mean(axis=1)
+        self.spread[index] = np.sqrt(((p - center[:, None]) ** 2).sum(axis=2).mean(axis=1))
+        self.axis[index] = n.mean(axis=1)
+        for place, i in enumerate(index):
+            shape = shapes[cells.emitter_index[i]]
+            low, high = _vector(shape.bbox().min), _vector(shape.bbox().max)
+            # No point of the whole light is farther away
+            farthest = np.maximum(high - center[place], center[place] - low)
+            self.reach[i] = np.linalg.norm(farthest)
+            if shape.class_name() in ("Rectangle", "Disk"):
+                self.angle[i] = 0.5 * np.pi
+
+    def _bins(self, cells: LightCells, index: np.ndarray, d: np.ndarray) -> None:
+        """Bins of an environment. ``d``: directions in each of them; shape [bins, points, 3]."""
+        self.is_infinite[index] = True
+        distance, area = _FAR * self._scene_radius, np.pi * self._scene_radius**2
+        mean = d.mean(axis=1)
+        self.center[index] = self._scene_center + distance * mean
+        square = ((d - mean[:, None]) ** 2).sum(axis=2).mean(axis=1)
+        self.spread[index] = distance * np.sqrt(square) + self._scene_radius
+        if len(index):
+            self.reach[index] = distance * cells.bins.diameter + self._scene_radius
+        # The cosine at a light without an axis is estimated as 1/4
+        self.strength[index] *= 4 * _SEEN * distance**2 / area
 
     def lights(self, rounding: float) -> Lights:
         """The lights. ``rounding``: the error of coordinates."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -71,6 +73,12 @@ class EnvironmentBins:
         entries[order, 0] = threshold.numpy().view(np.uint32)
         entries[order, 1] = order[alias.numpy()]
         self._entries = from_numpy(mi.UInt32, entries)
+
+    @property
+    def diameter(self) -> float:
+        """A bound of the distance between two directions of a bin."""
+        angle = math.hypot(2 * math.pi / self._bins[0], math.pi / self._bins[1])
+        return min(2.0, angle)
 
     def sample(
         self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool

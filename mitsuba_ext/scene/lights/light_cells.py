@@ -31,6 +31,8 @@ class LightCells:
         count (int): Number of cells.
         bins (EnvironmentBins | None): The bins of the environment; ``None`` if it is not divided.
         emitter_index (numpy.ndarray): The scene index of each cell's emitter; shape [count].
+        first_bin (int): The number of the first bin; ``count`` if there is none.
+        has_face_cells (bool): Whether the faces of meshes are cells.
         share (numpy.ndarray): The fraction of its emitter's area, or of the environment's emitted
             brightness, in each cell; shape [count].
         has_smooth_meshes (bool): Whether a light is a mesh with interpolated normals. Mitsuba's own
@@ -53,18 +55,19 @@ class LightCells:
             EmitterCells(scene, others, voxel, face_cells) if others else None
         )
         self.bins = None if environment is None else bins or EnvironmentBins(scene)
+        self.has_face_cells = face_cells > 0
         parts = [part for part in (self._emitters, self.bins) if part is not None]
         self.count = sum(part.count for part in parts)
         self.share = np.concatenate([part.share for part in parts])
         self.emitter_index = np.full(self.count, -1)
-        self._first_bin = self.count
+        self.first_bin = self.count
         self.has_smooth_meshes = self._emitters is not None and self._emitters.has_smooth_meshes
         if self._emitters is not None:
             self.emitter_index[: self._emitters.count] = self._emitters.emitter_index
         if self.bins is not None:
-            self._first_bin -= self.bins.count
+            self.first_bin -= self.bins.count
             index = next(i for i, e in enumerate(emitters) if e.ptr == environment.ptr)
-            self.emitter_index[self._first_bin :] = index
+            self.emitter_index[self.first_bin :] = index
 
     def first_cells(self) -> np.ndarray:
         """The first cell of each emitter, by its scene index."""
@@ -99,9 +102,9 @@ class LightCells:
             return self._emitters.sample(cell, ref, sample, active)
         if self._emitters is None:
             return self.bins.sample(cell, ref, sample, active)
-        in_bin = cell >= self._first_bin
+        in_bin = cell >= self.first_bin
         a, a_weight = self._emitters.sample(cell, ref, sample, active & ~in_bin)
-        b, b_weight = self.bins.sample(cell - self._first_bin, ref, sample, active & in_bin)
+        b, b_weight = self.bins.sample(cell - self.first_bin, ref, sample, active & in_bin)
         return dr.select(in_bin, b, a), dr.select(in_bin, b_weight, a_weight)
 
     def pdf(
@@ -121,6 +124,6 @@ class LightCells:
             return bin, bin_pdf
         cell, pdf = self._emitters.pdf(ref, si, ds, active & ~escaped)
         return (
-            dr.select(escaped, bin + self._first_bin, cell),
+            dr.select(escaped, bin + self.first_bin, cell),
             dr.select(escaped, bin_pdf, pdf),
         )

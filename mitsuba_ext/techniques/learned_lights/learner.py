@@ -9,11 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.costs import MAP_ENTRY
+from ...planning.costs import MAP_ENTRY, TREE
 from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
-from ...planning.verdicts import FINER_MAP_SHARE, FIRST_MAP_SHARE, REFINING, is_trial
+from ...planning.verdicts import (
+    FINER_MAP_SHARE,
+    FIRST_MAP_SHARE,
+    REFINING,
+    is_trial,
+    prefers_tree,
+)
 from ...scene.lights.environment_bins import EnvironmentBins
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.weights import uniform_weights
@@ -26,7 +32,9 @@ from ...scene.regions.surface_voxels import (
 )
 from ...transport.light_table import LightTable
 from ...transport.observer import Observer
+from ...transport.path_decisions import EmitterSampling
 from ...transport.rejection_law import RejectionLaw
+from ...transport.tree_choice import TreeChoice, tree_choice
 from ...util.stored_arrays import StoredArrays
 from . import light_map_arrays
 from .connection_records import ConnectionRecords
@@ -52,8 +60,9 @@ _FEW_ENTRIES = 1 << 17
 class LightMapLearner(Learner):
     """Learns a light map in the pilots, and chooses lights with it.
 
-    Where the pilots show that choosing lights as ``path`` does is nearly as efficient, and nothing
-    else needs the map, learning ends there.
+    With several lights, the first pilot chooses by a light tree. Where it shows that a map would
+    not be much more efficient, the tree stays, and learning ends there. It also ends where choosing
+    lights as ``path`` does is nearly as efficient, unless something else needs the map.
 
     Parameters:
         target: ``visibility`` or ``contribution``.
@@ -92,6 +101,8 @@ class LightMapLearner(Learner):
         self._about: dict[str, float] = {}
         self._is_kept: bool | None = None
         self._is_tested = False
+        self._tree: EmitterSampling | None = None
+        self._tree_prediction: Prediction | None = None
         # Makes a finer map than the first pilot had, with the same bins of the environment
         self._finer_map: Callable[[], LightMap] | None = None
         self._bins: EnvironmentBins | None = None
@@ -105,7 +116,7 @@ class LightMapLearner(Learner):
         """Keeps the map even where it does not pay for the choice of lights."""
         self._is_needed, self._records = True, None
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightTable | None:
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
         self.map, self._records, self._bins = None, None, None
         self._summary = "lights: no path scatters"
         if dr.width(p) > 0:
@@ -119,14 +130,17 @@ class LightMapLearner(Learner):
         self._scene = scene
         return self._begin_map()
 
-    def _begin_map(self) -> LightTable:
-        """The decision of the first pilot that fills a map."""
+    def _begin_map(self) -> EmitterSampling:
+        """The decision of the first pilot that fills a map: a light tree, if there are several
+        lights."""
         self._set_as_path(self._scene)
         self._is_tested = False
         if not self._is_needed:
             self._records = ConnectionRecords(
                 self._scene, self._pixels, self.map.rows.count, self._as_path
             )
+        if len(self._scene.emitters()) > 1:
+            return TreeChoice(self._scene, self.map.cells, self.map.rows)
         return self._selection(self._probabilities(self.map.unoccluded))
 
     def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
@@ -200,15 +214,15 @@ class LightMapLearner(Learner):
 
     # ---- Between the stages ----
 
-    def learn(self, pilot: Pilot) -> LightTable | None:
+    def learn(self, pilot: Pilot) -> EmitterSampling | None:
         if self.map is None:
-            return None
+            return self._tree
         self.map.evaluate()
         probabilities = self._probabilities(self.map.weights(self.target))
         if self._records is not None and not self._pays(probabilities, pilot):
             self.map = self._records = self._finer_map = None
-            self._is_kept = False
-            return None
+            self._is_kept = self._tree is not None
+            return self._tree
         # The records are kept in trials: most pilot samples come later
         if self._finer_map is not None and self._records is not None and not pilot.is_last:
             if self._efficiency >= REFINING:
@@ -219,9 +233,14 @@ class LightMapLearner(Learner):
         return self._selection(probabilities)
 
     def state(self) -> dict[str, np.ndarray]:
+        if self._tree is not None:
+            return {"tree": np.array(True)}
         return {} if self.map is None else light_map_arrays.arrays_of(self._scene, self.map)
 
-    def restore(self, scene: mi.Scene, state: StoredArrays) -> LightTable:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> EmitterSampling | None:
+        if "tree" in state:
+            self._is_kept, self._summary = True, "lights: a light tree"
+            return tree_choice(scene)
         self.map = light_map_arrays.of_arrays(state, scene, self.max_memory)
         self._set_as_path(scene)
         self.map.evaluate()
@@ -257,7 +276,13 @@ class LightMapLearner(Learner):
         if not self._about:
             self._measured = prediction.variance, time
         left, time = self._measured
-        self._effect = f"about {max(0.0, 1 - left):.0%} less variance in {time:.2f} x the time"
+        self._effect = _described(left, time)
+        if not self._is_tested:
+            self._tree_prediction = self._predict_tree()
+        tree = self._tree_prediction
+        if tree is not None and prefers_tree(tree, prediction):
+            self._take_tree(tree)
+            return False
         if not pilot.pays(prediction):
             would = f"a map would give {self._effect}"
             self._summary = f"lights as path chooses them: {would} ({self.map})"
@@ -268,6 +293,22 @@ class LightMapLearner(Learner):
         if not is_trial(share, pilot.is_last):
             self._finer_map = None
         return True
+
+    def _predict_tree(self) -> Prediction | None:
+        """What the last pilot tells about the light tree that it used, or a similar one; ``None``
+        if there is only one light."""
+        if len(self._scene.emitters()) < 2:
+            return None
+        gain, error = self._records.measured
+        time = self._records.cost + TREE
+        return Prediction(1 - gain, time, error)
+
+    def _take_tree(self, prediction: Prediction) -> None:
+        """Decides for the light tree."""
+        self._tree = tree_choice(self._scene)
+        self._measured = prediction.variance, prediction.time
+        self.removed, self._about = self._records.removed, {"tree": True}
+        self._summary = f"lights: a light tree, {_described(*self._measured)}"
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
         """The probabilities of cells, with a defensive share: errors of the map exclude no cell."""
@@ -286,7 +327,8 @@ class LightMapLearner(Learner):
         if self.removed is None:
             return
         left, trimmed = (x / max(x + self.removed, 1e-30) for x in (variance, trimmed))
-        self._measured, self._about = (left, self._measured[1]), {"trimmed_variance": trimmed}
+        self._measured = left, self._measured[1]
+        self._about |= {"trimmed_variance": trimmed}
 
     @property
     def effect(self) -> Effect | None:
@@ -296,6 +338,10 @@ class LightMapLearner(Learner):
 
     def __str__(self) -> str:
         return self._summary
+
+
+def _described(variance: float, time: float) -> str:
+    return f"about {max(0.0, 1 - variance):.0%} less variance in {time:.2f} x the time"
 
 
 def _normalized(weights: mi.Float, count: int) -> mi.Float:
