@@ -272,7 +272,9 @@ def test_a_learned_map_serves_another_view_and_lowers_the_variance(tmp_path: Pat
     scene = _two_rooms()
     maps, files = [], [tmp_path / f"{run}.npz" for run in range(2)]
     for file in files:
-        learn = mi.load_dict({"type": "neepp", "max_depth": 2, "save_learned": str(file)})
+        learn = mi.load_dict(
+            {"type": "neepp", "max_depth": 2, "grid": 8, "save_learned": str(file)}
+        )
         mi.render(scene, integrator=learn, spp=64, seed=3)
         with np.load(file) as data:
             counters = ("tests", "successes", "squares")
@@ -291,7 +293,8 @@ def test_a_learned_map_serves_another_view_and_lowers_the_variance(tmp_path: Pat
     use, path = (
         mi.load_dict({"max_depth": 2, **integrator})
         for integrator in (
-            {"type": "neepp", "load_learned": str(files[0]), "pilot_spp": 0}, {"type": "path"}
+            {"type": "neepp", "grid": 8, "load_learned": str(files[0]), "pilot_spp": 0},
+            {"type": "path"},
         )
     )
     images, reference = (
@@ -319,6 +322,18 @@ def _stage(**lights) -> mi.Scene:
     film = {"type": "hdrfilm", "width": 32, "height": 32}
     view = T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     return floor(sensor={"type": "perspective", "to_world": view, "film": film}, **lights)
+
+
+def test_a_light_tree_is_kept_where_a_map_is_hardly_better(tmp_path: Path):
+    scene, file = _two_rooms(), tmp_path / "learned.npz"
+    learned = _learned(scene, save_learned=str(file))
+    assert learned.startswith("lights: a light tree, about ")
+    loads = {"type": "neepp", "load_learned": str(file)}
+    loaded, tree = (
+        np.array(mi.load_dict({"max_depth": 2, **made}).render(scene, spp=1))
+        for made in (loads, {"type": "composed_path", "next_event": "tree"})
+    )
+    np.testing.assert_array_equal(loaded, tree)
 
 
 def test_learning_ends_where_it_would_not_pay():

@@ -6,12 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import stats
 
 from mitsuba_ext.scene.lights.light_cells import LightCells
+from mitsuba_ext.transport.light_table import OneRow
 from mitsuba_ext.transport.tree_choice import TreeChoice, tree_choice
 from tests.support.light_choices import (
     LANES,
     assert_density_fits,
+    connect,
     counts_at,
     floor,
     mixed_lights,
@@ -70,6 +73,51 @@ def test_mean_with_all_kinds_of_lights_and_glass_agrees_with_path(plugin, depth)
 def test_emitters_are_chosen_as_often_as_the_density_says():
     scene = mi.load_dict(mixed_lights())
     assert_density_fits(tree_choice(scene), scene)
+
+
+def _in_parts(scene: mi.Scene, *voxel: float) -> TreeChoice:
+    """The choice among parts of lights, and bins of an environment."""
+    return TreeChoice(scene, LightCells(scene, mi.Vector3f(*voxel)), OneRow())
+
+
+def test_parts_are_chosen_as_often_as_the_density_says_and_none_that_lights_a_point_is_excluded():
+    """Neither by the horizon of the point, nor by the directions in which the part shines."""
+    scene = floor(
+        diffuse(),
+        window=panel(0.5, 0, 0.3, angle=100, size=1.5),
+        tube={"type": "cylinder", "p0": [-1, -1, 0.4], "p1": [1, -1, 0.1], "radius": 0.2,
+              "emitter": area(2.0)},
+        box={"type": "cube", "to_world": translate(-0.7, 0.5, 0.3).scale(0.25),
+             "emitter": area(2.0)},
+        sky={"type": "constant", "radiance": rgb(0.1)},
+    )  # fmt: skip
+    selection = _in_parts(scene, 0.2, 0.2, 0.2)
+    cells, count = selection.cells, 64
+    assert cells.first_bin > 40 and cells.bins.count == 512
+    index = dr.arange(mi.UInt32, cells.count * count)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(index))
+    for place in ([0.2, 0.1, 0], [-0.4, 0.3, 0], [0.9, -0.6, 0]):
+        si = vertex_at(scene, [place[0], place[1], 0.01], place)
+        probability = _probabilities(selection, scene, si)
+        assert probability.sum() == pytest.approx(1, abs=1e-4)
+        numbers = mi.load_dict({"type": "independent"})
+        numbers.seed(7, LANES)
+        choice = connect(selection, scene, numbers, si)[2]
+        np.testing.assert_allclose(
+            choice.probability.numpy(), probability[choice.cell.numpy()], rtol=1e-3
+        )
+        counts = np.bincount(choice.cell.numpy(), minlength=cells.count)
+        expected = LANES * probability
+        frequent = expected > 5
+        chi2 = ((counts - expected)[frequent] ** 2 / expected[frequent]).sum()
+        assert stats.chi2.sf(chi2, frequent.sum()) > 1e-4 and not counts[expected == 0].any()
+        si = dr.gather(mi.SurfaceInteraction3f, si, dr.zeros(mi.UInt32, len(index)))
+        ds, weight = cells.sample(index // count, si, sampler.next_2d(), mi.Bool(True))
+        shines = (dr.max(weight) > 0) & (dr.dot(ds.d, si.n) > 0)
+        shines = shines.numpy().reshape(-1, count).any(axis=1)
+        assert 0.3 < shines.mean() < 0.95
+        assert (probability[shines] > 0).all()
 
 
 def _probabilities(selection: TreeChoice, scene: mi.Scene, si: mi.SurfaceInteraction3f):
