@@ -58,7 +58,7 @@ class Auto(LightPathIntegrator):
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
          all samples. They count towards the image. With 0, it learns nothing and renders as
-         :monosp:`path` does. (Default: 32)
+         :monosp:`path` does, with a light tree. (Default: 32)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -77,7 +77,7 @@ class Auto(LightPathIntegrator):
          aovs, checkpoint.
 
     **Use it when** you do not know which technique a scene needs. **Not when** an image has fewer
-    than 16 samples per pixel: there is too little to learn from.
+    than 16 samples per pixel and one light: there is too little to learn from.
 
     The first two pilots are the same as in :class:`auto_path`. A short trial follows, with one
     light path for each camera path, all techniques, and the lights learned so far. Its samples
@@ -92,8 +92,9 @@ class Auto(LightPathIntegrator):
     variance to less than 0.4 of its value, the samples before the trial are left out of the image.
 
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
-    the integrator skips learning and renders as :monosp:`path` does, unless it saves or keeps what
-    it learns. Learning, and compiling the kernels that it needs, would take longer than rendering
+    the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
+    several lights by a light tree (:monosp:`next_event=tree` of :class:`composed_path`), unless it
+    saves or keeps what it learns. Learning, and compiling the kernels that it needs, would take longer than rendering
     all samples. :monosp:`statistics.learned` then says so.
     The shorter a render is, the more light paths must gain: 1.1 times the efficiency of everything
     else that was learned, and twice that efficiency in renders of half a million samples. With a

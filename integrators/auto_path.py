@@ -28,7 +28,7 @@ class AutoPath(WalkIntegrator):
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
          all samples. They count towards the image. With 0, it learns nothing and renders as
-         :monosp:`path` does. (Default: 32)
+         :monosp:`path` does, with a light tree. (Default: 32)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -55,7 +55,8 @@ class AutoPath(WalkIntegrator):
          aovs, checkpoint.
 
     **Use it when** you do not know which technique a scene needs, and render 16 or more samples per
-    pixel. **Not when** an image has fewer samples (too few to learn from), or when small lamps
+    pixel. **Not when** an image has fewer samples (too few to learn from: several lights are then
+    chosen by a light tree), or when small lamps
     shine through glass (camera paths do not find their light).
 
     It is :monosp:`composed_path` with :monosp:`directions=guided`,

@@ -63,8 +63,8 @@ class NEEPlusPlus(WalkIntegrator):
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With 0, it learns nothing: lights are chosen as
-         in :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots
+         all samples. They count towards the image. With 0, it learns nothing: lights are chosen by
+         a light tree, and every shadow ray is traced. With a stratified sampler, pilots
          consist of whole passes, and can be longer. (Default: 16)
      * - save_learned, load_learned
        - |string|
@@ -105,8 +105,9 @@ class NEEPlusPlus(WalkIntegrator):
     glossy light: learning then costs time and gains nothing.
 
     A first sample per pixel, which is not added to the film, finds the surfaces and the region in
-    which paths scatter. Each pilot except the first chooses its lights by what the earlier pilots
-    have learned. If these show that the gain is small, learning ends early, unless
+    which paths scatter. The first pilot chooses among several lights by a light tree, which is kept
+    if a learned table would not be much better. Otherwise each further pilot chooses its lights by
+    what the earlier pilots have learned. If these show that the gain is small, learning ends early, unless
     :monosp:`grid` or :monosp:`rejection` is given.
 
     Participating media are rendered as in :monosp:`volpath`; lights are learned for points in media

@@ -65,7 +65,13 @@ def cell_bounds(scene: mi.Scene, cells: LightCells, power: np.ndarray) -> tuple[
 
 def _is_flat(emitter: mi.Emitter, shape: mi.Shape) -> bool:
     """Whether the light consists of triangles whose front sides are diffuse lights."""
-    return emitter.class_name() == "AreaLight" and shape.is_mesh() and shape.face_count() > 0
+    return _is_diffuse(emitter) and shape.is_mesh() and shape.face_count() > 0
+
+
+def _is_diffuse(emitter: mi.Emitter) -> bool:
+    """Whether the light of a surface leaves its front side evenly: ``area`` and
+    ``solid_angle_area``."""
+    return emitter.class_name() == "AreaLight" or type(emitter).__name__ == "SolidAngleArea"
 
 
 def _vector(v: mi.Vector3f) -> np.ndarray:
@@ -146,7 +152,7 @@ class _CellBounds:
         if kind == "Sphere":
             radius = self.reach[cell] / np.sqrt(3)
             self.spread[cell], self.reach[cell] = radius / np.sqrt(2), radius
-        if kind == "Disk" and emitter.class_name() == "AreaLight":
+        if kind == "Disk" and _is_diffuse(emitter):
             ps = shape.sample_position(0.0, mi.Point2f(0.5))
             self.axis[cell], self.angle[cell] = _vector(ps.n), 0.5 * np.pi
 

@@ -227,6 +227,7 @@ def test_lights_that_shine_elsewhere_are_not_chosen():
         away=panel(0, 0, 1, radiance=1000.0),
         disk={"type": "disk", "to_world": translate(0.5, 0, 2), "emitter": area(1000.0)},
         down=panel(0, 1, 1, angle=180),
+        by_angle=panel(0, 0, 1) | {"emitter": area(1000.0) | {"type": "solid_angle_area"}},
         # The vertex is behind its centre's horizon, but not behind its plane
         grazing=panel(1, 0, 0.001, angle=90, size=0.5),
         beside=spot | {"to_world": lookat([0, 0, 2], [0.9, 0, 0], [0, 1, 0])},
@@ -234,6 +235,7 @@ def test_lights_that_shine_elsewhere_are_not_chosen():
     )  # fmt: skip
     counts = _counts(scene)
     assert counts["away"] == 0 and counts["disk"] == 0 and counts["beside"] == 0
+    assert counts["by_angle"] == 0
     assert counts["down"] > 10 and counts["grazing"] > 10 and counts["at"] > 100
 
 
