@@ -109,9 +109,10 @@ class NoMedia:
         """The ``active`` paths that may change their direction."""
         return active
 
-    def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight):
+    def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight, is_given=False):
         """The direction sample of ``vertex`` and its weight: in a medium from the phase function,
-        elsewhere ``bs`` and ``weight``, which come from the BSDF."""
+        elsewhere ``bs`` and ``weight``, which come from the BSDF. If the direction in a medium
+        ``is_given``, ``sample_2`` is its point (:func:`direction_at`)."""
         return bs, weight
 
     def scattered(self, bs, active) -> mi.Bool:
@@ -278,11 +279,15 @@ class Media(NoMedia):
             self._distances.exact_transmittance, finds_way, sampler, active,
         )  # fmt: skip
 
-    def scatter(self, vertex, sample_1, sample_2, bs, weight):
+    def scatter(self, vertex, sample_1, sample_2, bs, weight, is_given=False):
         in_medium, si = vertex.medium, vertex.si
         scatters, mei = in_medium.scatters, in_medium.mei
-        phase = mei.medium.phase_function()
-        wo, phase_weight, pdf = phase.sample(_context(), mei, sample_1, sample_2, scatters)
+        if is_given:
+            wo = direction_at(sample_2)
+            value, pdf = eval_phase(mei, wo, scatters)
+            phase_weight = value / pdf
+        else:
+            wo, phase_weight, pdf = sample_phase(mei, sample_1, sample_2, scatters)
         bs = mi.BSDFSample3f(bs)
         bs.wo = dr.select(scatters, si.to_local(wo), bs.wo)
         bs.pdf = dr.select(scatters, pdf, bs.pdf)
@@ -330,6 +335,25 @@ class Media(NoMedia):
 
     def sees_light(self, path, si, scattered):
         return path.depth != 0
+
+
+def sample_phase(
+    mei: mi.MediumInteraction3f, sample_1: mi.Float, sample_2: mi.Point2f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+    """A direction from the phase function (in world space), value / density, and its density."""
+    phase = mei.medium.phase_function()
+    return phase.sample(_context(), mei, sample_1, sample_2, active)
+
+
+def direction_at(point: mi.Point2f) -> mi.Vector3f:
+    """The direction (in world space) at a point of the unit square, which is mapped to the sphere
+    with equal areas."""
+    return mi.warp.square_to_uniform_sphere(point)
+
+
+def point_of(d: mi.Vector3f) -> mi.Point2f:
+    """The inverse of :func:`direction_at`."""
+    return mi.warp.uniform_sphere_to_square(d)
 
 
 def eval_phase(

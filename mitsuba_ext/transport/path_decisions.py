@@ -23,7 +23,14 @@ from .vertex import PathState, Vertex
 
 class DirectionSamples:
     """The primary samples that choose the lobe and the direction of a BSDF sample. This class draws
-    uniform ones."""
+    uniform ones.
+
+    Attributes:
+        gives_directions: Whether the two numbers for a vertex in a medium are the direction itself
+            (:func:`.media.direction_at`), and not primary samples of the phase function.
+    """
+
+    gives_directions = False
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         """The state before the first bounce of paths that begin in ``pixel`` of the film."""

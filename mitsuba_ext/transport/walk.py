@@ -267,7 +267,9 @@ class Walk:
                 L[visible] += unoccluded
                 connection_count += dr.select(considered, 1, 0)
                 shadow_count += dr.select(tested, 1, 0)
-            bs, bsdf_weight = media.scatter(vertex, sample_1, sample_2, bs, bsdf_weight)
+            bs, bsdf_weight = media.scatter(
+                vertex, sample_1, sample_2, bs, bsdf_weight, self.directions.gives_directions
+            )
             self.observer.direction(vertex, sample_2, directions_weight, L, turns)
             self.observer.scattering(vertex, bs, active)
             if dr.hint(self.replay is not None, mode="scalar"):

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...transport.media import direction_at, eval_phase, point_of, sample_phase
 from ...transport.path_decisions import DirectionSamples, Roulette
 from ...util.arrays import channel_mean
 from .sample_trees import SampleTrees
@@ -32,7 +33,13 @@ _DEEP, _DEEP_PROBABILITY = 16, 0.95
 
 
 class Regions(Protocol):
-    """Decides from which tree a sample is drawn."""
+    """Decides from which tree a sample is drawn.
+
+    Attributes:
+        gives_directions: See :class:`DirectionSamples`.
+    """
+
+    gives_directions: bool
 
     def begin(self, pixel: mi.UInt32 | None) -> Any:
         """The state of paths that begin in ``pixel``."""
@@ -74,8 +81,14 @@ class GuidedDirections(DirectionSamples):
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         return self.regions.begin(pixel)
 
+    @property
+    def gives_directions(self) -> bool:
+        return self.regions.gives_directions
+
     def draw(self, state, sampler, vertex, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
+        if self.gives_directions and vertex.medium is not None:
+            return sample_1, *self._draw_in_media(state, vertex, sample_1, sample_2, active)
         # A branch, so that later bounces cost nothing
         sample_2, weight, state = dr.if_stmt(
             (state, vertex.si, sample_2),
@@ -90,6 +103,30 @@ class GuidedDirections(DirectionSamples):
         tree = self.regions.tree(state, si, active)
         sample, density, leaf = self.trees.sample(tree, sample, active)
         return sample, dr.rcp(density), self.regions.after(state, self.trees, leaf, active)
+
+    def _draw_in_media(self, state, vertex, sample_1, sample_2, active):
+        """Draws the direction where a path scatters in a medium: from the tree, or from the phase
+        function. Elsewhere, draws primary samples, as without media."""
+        in_medium, mei = vertex.medium.scatters, vertex.medium.mei
+        guided = active & (vertex.depth < self._bounces)
+        tree = self.regions.tree(state, vertex.si, guided)
+        share, by_tree, u = self.trees.choose(tree, sample_2, guided)
+        d, _, _ = sample_phase(mei, sample_1, u, in_medium & ~by_tree)
+        u = dr.select(in_medium & ~by_tree, point_of(d), u)
+        # A branch, so that bounces that are not guided cost nothing
+        u, density, leaf = dr.if_stmt(
+            (tree, u, by_tree),
+            guided & (share > 0),
+            lambda tree, u, by_tree: self.trees.descend(tree, u, by_tree, mi.Bool(True)),
+            lambda tree, u, by_tree: (u, mi.Float(1), tree),
+        )
+        _, pdf = eval_phase(mei, direction_at(u), guided & in_medium)
+        # The density of primary samples (regions_with_media.py)
+        density *= dr.select(in_medium, dr.inv_four_pi / pdf, 1)
+        weight = dr.rcp(dr.fma(share, density, 1 - share))
+        # Where the phase function is zero, the path ends
+        weight = dr.select(guided & (share > 0) & ~(in_medium & (pdf == 0)), weight, 1)
+        return u, weight, self.regions.after(state, self.trees, leaf, guided)
 
     def density(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f
@@ -138,9 +175,10 @@ class AdjointRoulette(Roulette):
         radiance = dr.gather(mi.Float, self._radiance, region, active)
         expected = channel_mean(path.β) * radiance * state
         p = dr.clip(expected * (1 / _CERTAIN), _LEAST, 1)
-        p = dr.select(radiance < 0, 1, p)
+        is_unknown = radiance < 0
+        p = dr.select(is_unknown, 1, p)
         if vertex.medium is not None:
-            # No mean is known in media, and paths scatter there often
+            # Paths scatter there often: they must not go on with certainty
             by_throughput, _ = super().survival(None, vertex, path, active)
-            p = dr.select(vertex.medium.scatters, by_throughput, p)
+            p = dr.select(vertex.medium.scatters & is_unknown, by_throughput, p)
         return dr.select(path.depth >= _DEEP, dr.minimum(p, _DEEP_PROBABILITY), p), state

@@ -22,7 +22,6 @@ from .decisions import AdjointRoulette, GuidedDirections, Regions
 from .path_records import BYTES_PER_RECORD, PathRecords
 from .roulette_trial import BYTES_PER_PATH, RouletteTrial
 from .sample_trees import SampleTrees
-from .surface_regions import SurfaceRegions
 
 #: The share of the samples that trees decide in the second pilot, and the shares from which one is
 #: chosen once their effects have been measured.
@@ -103,10 +102,10 @@ class GuideLearner(Learner):
             return None
         self._regions = self.make_regions(p, n)
         self._begin_records()
-        if not isinstance(self._regions, SurfaceRegions):
+        if not self.wants_scout:
             return None
         # As ``path``, but with the kernel of the pilots that follow
-        count = self._regions.count + 1
+        count = self._regions.tree_count
         if self._rr_depth is not None:
             self.roulette = AdjointRoulette.by_throughput(
                 self._regions, count, self.pixel_count
@@ -120,7 +119,10 @@ class GuideLearner(Learner):
         stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
         if self._rr_depth is not None:
             self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
-        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
+        regions = self._regions
+        self._records = PathRecords(
+            regions.label, self.bounces, stride, self._pixels, regions.gives_directions
+        )
 
     def learn_roulette(self, rr_depth: int) -> None:
         """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
@@ -165,6 +167,10 @@ class GuideLearner(Learner):
     def direction(self, *arguments: Any) -> None:
         for observer in self._observers():
             observer.direction(*arguments)
+
+    def scattering(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.scattering(*arguments)
 
     def survival(self, *arguments: Any) -> None:
         for observer in self._observers():

@@ -9,8 +9,10 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
+from ...scene.media import may_have_media
 from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
+from .regions_with_media import RegionsWithMedia
 from .surface_regions import BYTES_PER_REGION, SurfaceRegions
 from .tile_regions import MOST_BOUNCES, TileRegions
 
@@ -55,12 +57,14 @@ class Guided(Technique):
         def tiles(p: mi.Point3f, n: mi.Normal3f) -> TileRegions:
             return TileRegions(width, height, self.tile)
 
+        kind = RegionsWithMedia if may_have_media(setting.scene) else SurfaceRegions
+
         def surfaces(p: mi.Point3f, n: mi.Normal3f) -> SurfaceRegions:
             # The scout has one path in each pixel
             least = max(1.0, _REGION_SAMPLES * width * height / samples)
             # Records take the other half of the memory
             most = int(self.max_memory * 2**20 / 2) // BYTES_PER_REGION
-            return SurfaceRegions(p, n, least, max(1, most))
+            return kind(p, n, least, max(1, most))
 
         by_tiles = self.regions == "tiles"
         return GuideLearner(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -16,12 +16,25 @@ from ...util.arrays import joined
 from .cells import DEPTH, cell_code
 
 #: The most bytes of a record, including the temporaries while trees are built.
-BYTES_PER_RECORD = 320
+BYTES_PER_RECORD = 328
 
 
 @dataclass
-class _Columns:
-    """What is recorded of each sample."""
+class Samples:
+    """What is recorded of each sample.
+
+    Attributes:
+        region, code: Its region, and the cell of the primary sample.
+        history: The cells of the path's earlier samples, the last one in the low byte.
+        bounce: The number of the bounce, 0 for the first.
+        value: What the path contributed after the bounce, divided by the densities of its samples.
+        weight: 1 / density of the sample.
+        importance: The weight of a squared error in the pixel of the path.
+        throughput: The path's throughput after this bounce, before roulette.
+        batch: The batch of paths (``evidence.py``).
+        measure: The area, in the square of cells, of a unit of primary samples: not 1 where the
+            cells are cells of directions. ``None`` where there are no such samples.
+    """
 
     region: mi.UInt32
     code: mi.UInt32
@@ -32,6 +45,7 @@ class _Columns:
     importance: mi.Float
     throughput: mi.Float
     batch: mi.UInt32
+    measure: mi.Float | None = None
 
 
 class PathRecords(Observer):
@@ -43,20 +57,14 @@ class PathRecords(Observer):
         bounces: Number of bounces of a path that are recorded.
         stride: One in ``stride`` paths is recorded.
         pixels: Receives the radiance of the paths.
+        gives_directions: Whether samples in media are points of directions
+            (:class:`~mitsuba_ext.transport.path_decisions.DirectionSamples`).
 
     Attributes:
         paths (int): How many paths were recorded.
-        region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
-        history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
-        bounce (mi.UInt32): The number of the bounce, 0 for the first.
-        throughput (mi.Float): The path's throughput after this bounce, before roulette.
-        value (mi.Float): What the path contributed after the bounce, divided by the densities of
-            its samples.
-        weight (mi.Float): 1 / density of the sample.
-        importance (mi.Float): The weight of a squared error in the pixel of the path.
-        batch (mi.UInt32): The batch of paths (``evidence.py``).
-        variances (numpy.ndarray): Sums over the paths of their squared errors, with this weight;
-            shape [batches].
+        variances (numpy.ndarray): Sums over the paths of their squared errors, weighted by
+            ``importance``; shape [batches].
+        region, code, …: The columns of :class:`Samples`.
     """
 
     def __init__(
@@ -65,11 +73,14 @@ class PathRecords(Observer):
         bounces: int,
         stride: int,
         pixels: PixelEstimates,
+        gives_directions: bool = False,
     ) -> None:
+        self._gives_directions = gives_directions
+        self._measure: mi.Float | None = None
         self._region, self.bounces, self.stride = region, bounces, stride
         self._pixels = pixels
         self._lanes = 0
-        self._passes: list[_Columns] = []
+        self._passes: list[Samples] = []
         self.restart_counting()
 
     def restart_counting(self) -> None:
@@ -91,7 +102,7 @@ class PathRecords(Observer):
         """The attributes on which kernels depend (``frozen.py``)."""
         return (
             self._region, self.bounces, self._pixel, self._path, self._is_recorded, self._slots,
-            self._keys, self._weights, self._before, self._throughput, self._total,
+            self._keys, self._weights, self._before, self._throughput, self._total, self._measure,
         )  # fmt: skip
 
     # ---- Observer of the walk ----
@@ -109,10 +120,12 @@ class PathRecords(Observer):
         self._weights, self._before, self._throughput = (
             dr.zeros(mi.Float, slots) for _ in range(3)
         )
+        if self._gives_directions:
+            self._measure = dr.full(mi.Float, 1, slots)
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         dr.eval(
             self._path, self._is_recorded, self._keys, self._weights, self._before,
-            self._throughput, self._total,
+            self._throughput, self._total, self._measure,
         )  # fmt: skip
 
     def direction(self, vertex, sample, weight, L, active) -> None:
@@ -123,6 +136,13 @@ class PathRecords(Observer):
         dr.scatter(self._weights, mi.Float(weight), slot, active)
         dr.scatter(self._before, brightness(L), slot, active)
 
+    def scattering(self, vertex, bs, active) -> None:
+        if self._gives_directions and vertex.medium is not None:
+            active = active & vertex.medium.scatters & self._is_recorded
+            active &= vertex.depth < self.bounces
+            slot = vertex.depth * self._slots + self._path
+            dr.scatter(self._measure, dr.inv_four_pi / bs.pdf, slot, active & (bs.pdf > 0))
+
     def survival(self, path, probability, active) -> None:
         active = active & self._is_recorded & (path.depth <= self.bounces)
         slot = (path.depth - 1) * self._slots + self._path
@@ -132,6 +152,12 @@ class PathRecords(Observer):
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
 
     # ---- Between passes ----
+
+    def chosen(self, chosen: mi.Bool) -> Samples:
+        """Some of the samples, after :meth:`finish`."""
+        index = dr.compress(chosen)
+        columns = (getattr(self, field.name) for field in fields(Samples))
+        return Samples(*(dr.gather(type(x), x, index) for x in columns))
 
     def finish(self) -> None:
         """Ends the observation of a stage."""
@@ -171,14 +197,15 @@ class PathRecords(Observer):
             code = dr.gather(mi.UInt32, self._keys, earlier * self._slots + path, is_earlier)
             code &= (1 << DEPTH) - 1
             history = dr.select(is_earlier, (history << DEPTH) | code, history)
-        columns = _Columns(
+        columns = Samples(
             key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
             dr.gather(mi.Float, importance, path), dr.gather(mi.Float, self._throughput, slot),
             path % BATCHES,
+            dr.gather(mi.Float, self._measure, slot) if self._gives_directions else None,
         )  # fmt: skip
         dr.eval(columns)
         self._passes.append(columns)
-        self._keys = self._weights = self._before = self._throughput = None
+        self._keys = self._weights = self._before = self._throughput = self._measure = None
         self._total = self._pixel = None
 
 

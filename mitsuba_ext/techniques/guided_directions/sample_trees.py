@@ -141,21 +141,29 @@ class SampleTrees:
             The sample in [0, 1)², its density, and the number of its leaf. In inactive lanes they
             are ``u``, 1 and the tree's number.
         """
+        share, by_tree, u = self.choose(tree, u, active)
+        point, density, leaf = self.descend(tree, u, by_tree, active & (share > 0))
+        return point, dr.fma(share, density, 1 - share), leaf
+
+    def choose(
+        self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Bool, mi.Point2f]:
+        """The share of the samples that follow a tree, whether uniform numbers ``u`` choose to
+        follow it, and the uniform numbers that are left of them. In inactive lanes they are 0,
+        false and ``u``."""
         share = dr.gather(mi.Float, self.share, tree, active)
         by_tree = u.x < share
         # The number that chose between the two densities is rescaled to [0, 1)
         x = dr.select(by_tree, u.x / share, (u.x - share) / (1 - share))
-        active = active & (share > 0)
-        x = dr.select(active, dr.minimum(x, _ALMOST_ONE), u.x)
-        point, density, leaf = self._descend(tree, mi.Point2f(x, u.y), by_tree, active)
-        return point, dr.fma(share, density, 1 - share), leaf
+        x = dr.select(share > 0, dr.minimum(x, _ALMOST_ONE), u.x)
+        return share, by_tree, mi.Point2f(x, u.y)
 
     def density(
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Float, mi.UInt32]:
         """The density of a sample, and the number of its leaf."""
         share = dr.gather(mi.Float, self.share, tree, active)
-        _point, density, leaf = self._descend(tree, u, mi.Bool(False), active & (share > 0))
+        _point, density, leaf = self.descend(tree, u, mi.Bool(False), active & (share > 0))
         return dr.fma(share, density, 1 - share), leaf
 
     def value(self, leaf: mi.UInt32, active: mi.Bool) -> mi.UInt32:
@@ -163,11 +171,16 @@ class SampleTrees:
         return dr.gather(mi.UInt32, self._values, leaf, active)
 
     @dr.syntax
-    def _descend(
+    def descend(
         self, root: mi.UInt32, u: mi.Point2f, by_tree: mi.Bool, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float, mi.UInt32]:
         """Goes down to a leaf: by the probabilities where ``by_tree``, else to the leaf that
-        contains ``u``."""
+        contains ``u``.
+
+        Returns:
+            A point in the leaf (``u`` itself if not ``by_tree``), the density there of samples that
+            follow the tree, and the number of the leaf.
+        """
         x, y = mi.Float(u.x), mi.Float(u.y)       # Coordinates of the sample within its cell
         column, row = mi.UInt32(0), mi.UInt32(0)  # Number of the cell among cells of its size
         edge = mi.Float(1)                        # Edge of the cell

@@ -11,7 +11,7 @@ from ...scene.regions.surface_voxels import lit_normal
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .cells import Cells
-from .path_records import PathRecords
+from .path_records import Samples
 from .sample_trees import SampleTrees
 from .tree_builder import Nodes, grown
 
@@ -39,7 +39,11 @@ class SurfaceRegions:
 
     Attributes:
         count: Number of regions that learn.
+        gives_directions: Whether samples in media are points of directions
+            (:class:`~mitsuba_ext.transport.path_decisions.DirectionSamples`).
     """
+
+    gives_directions = False
 
     def __init__(
         self, p: mi.Point3f, n: mi.Normal3f, least: float, most: int = 1 << 30
@@ -83,11 +87,15 @@ class SurfaceRegions:
 
     def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
         """The region under which a sample is recorded."""
-        region = self._regions.number(si.p, lit_normal(si), active)
+        region = self.number(si.p, lit_normal(si), active)
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
 
-    def build(self, records: PathRecords) -> tuple[Nodes, mi.UInt32, None]:
+    def number(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> mi.UInt32:
+        """The smallest region that contains a point with the normal ``n`` on its lit side."""
+        return self._regions.number(p, n, active)
+
+    def build(self, records: Samples) -> tuple[Nodes, mi.UInt32, None]:
         """Builds the trees.
 
         Returns:
@@ -104,7 +112,7 @@ class SurfaceRegions:
         """For each region, the one around it; mirrors and glass have none."""
         return from_numpy(mi.UInt32, np.append(self._regions.parent, self.count))
 
-    def incident_radiance(self, records: PathRecords) -> mi.Float:
+    def incident_radiance(self, records: Samples) -> mi.Float:
         """The mean radiance that bounces find in each region; the surrounding region is the prior.
         −1 for mirrors and glass. Shape [regions]."""
         value, throughput, count = self._sums(records)
@@ -122,14 +130,14 @@ class SurfaceRegions:
             )
         return from_numpy(mi.Float, np.minimum(radiance, 1e30))
 
-    def _sums(self, records: PathRecords) -> np.ndarray:
+    def _sums(self, records: Samples) -> np.ndarray:
         """The sums of values and throughputs, and the number of records, in each region."""
         values = records.value, records.throughput
         # In units relative to the mean: sums of integers do not depend on their order
         count = dr.opaque(mi.Float64, len(records.region))
         means = [dr.maximum(dr.sum(mi.Float64(x)) / count, 1e-30) for x in values]
         units = [mi.UInt64(mi.Float64(x) / mean * _UNITS + 0.5) for x, mean in zip(values, means)]
-        sums = dr.zeros(mi.UInt64, 3 * self.tree_count)
+        sums = dr.zeros(mi.UInt64, 3 * (self.count + 1))
         for index, x in enumerate((*units, mi.UInt64(1))):
             place = 3 * records.region + index
             dr.scatter_add(sums, x, place, x > 0, mode=dr.ReduceMode.Direct)

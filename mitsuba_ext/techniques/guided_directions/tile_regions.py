@@ -37,6 +37,8 @@ class TileRegions:
         count: Number of tiles.
     """
 
+    gives_directions = False
+
     def __init__(self, width: int, height: int, tile: int) -> None:
         self._tiles = FilmTiles(width, height, tile)
         self.count = self._tiles.count
