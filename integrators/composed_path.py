@@ -151,9 +151,8 @@ class ComposedPath(WalkIntegrator):
     and :monosp:`hide_emitters` also hides a light that the camera sees through fog. In such scenes,
     :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
     :monosp:`tree`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other
-    choices need a surface and refuse the scene. A guide for :monosp:`directions` with regions of
-    surfaces guides at surfaces only; a guide with tiles guides everywhere. If the
-    extinction of any medium differs between colours, each flight chooses the colour that samples
+    choices need a surface and refuse the scene. A guide for :monosp:`directions` also guides where
+    paths scatter in media. If the extinction of any medium differs between colours, each flight chooses the colour that samples
     its distance in proportion to the throughput, and all colours count in its density (spectral
     MIS, as in :monosp:`volpathmis`, in grids too). Lights at infinity should not shine into an
     unbounded medium. With Mitsuba's :monosp:`ldsampler`, images of media have errors of 1 to 2 %,

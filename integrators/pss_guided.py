@@ -90,8 +90,8 @@ class PSSGuided(WalkIntegrator):
     After a render, :monosp:`integrator.statistics.learned` describes what was learned, and
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
-    Participating media are rendered as in :monosp:`volpath`; in them, directions are guided by
-    tiles only. Gradients are not supported (use :class:`composed_prb`); neither are scalar and
+    Participating media are rendered as in :monosp:`volpath`. The directions in which fog scatters
+    are guided, too. Gradients are not supported (use :class:`composed_prb`); neither are scalar and
     polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of

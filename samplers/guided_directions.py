@@ -25,7 +25,7 @@ class GuidedDirectionsPlugin(DecisionPlugin):
      * - regions
        - |string|
        - What a tree of samples belongs to. :monosp:`surfaces`: a voxel and a side of the surfaces
-         in it; every bounce uses the tree of its place. :monosp:`tiles`: a tile of the film, as in
+         in it, or a voxel of a medium; every bounce uses the tree of its place. :monosp:`tiles`: a tile of the film, as in
          the thesis; the sample of a path's first bounce decides which tree the second uses, and so
          on. (Default: surfaces)
      * - tile
@@ -62,6 +62,12 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     describes what was learned, and :monosp:`integrator.learners["directions"].guide` is the learned
     guide (see examples/learned_samples.py).
 
+    In participating media, phase functions take the place of BSDFs. They scatter relative to the
+    direction of the path, so that equal numbers lead to other directions in each path. The trees of
+    media are therefore over directions in space, of which at least a fifth is drawn from the phase
+    function. How far a path flies before it scatters is not guided (but see :class:`swarm_path`).
+    With tiles, the numbers of phase functions are guided like those of BSDFs.
+
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, to no effect). With regions of surfaces, Russian roulette is learned as
     well (:monosp:`roulette` of :monosp:`composed_path`): it continues paths that are expected to
@@ -71,8 +77,9 @@ class GuidedDirectionsPlugin(DecisionPlugin):
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light
-    Transport Simulation*, 2016: roulette (without splitting). The regions of surfaces, the
-    estimates, and the measurement of the gain are ours.
+    Transport Simulation*, 2016: roulette (without splitting). S. Herholz et al., *Volume Path
+    Guiding Based on Zero-Variance Random Walk Theory*, 2019: directions in media. The regions of
+    surfaces, the estimates, and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

@@ -1541,9 +1541,9 @@ def guided_directions(
 
     Parameters:
         regions (string): What a tree of samples belongs to. surfaces: a voxel and a side of the
-            surfaces in it; every bounce uses the tree of its place. tiles: a tile of the film, as
-            in the thesis; the sample of a path's first bounce decides which tree the second uses,
-            and so on. (Default: surfaces)
+            surfaces in it, or a voxel of a medium; every bounce uses the tree of its place. tiles:
+            a tile of the film, as in the thesis; the sample of a path's first bounce decides which
+            tree the second uses, and so on. (Default: surfaces)
         tile (int): Edge of a tile in pixels; accepted only with tiles. (Default: 16)
         bounces (int): Maximum number of directions of a path that are guided, up to 64 (with tiles,
             up to 5). (Default: 6; 2 with tiles)

@@ -115,8 +115,9 @@ class RegionsWithMedia:
         directions."""
         on_surfaces = records.chosen(records.region < self._first)
         in_media = records.chosen(records.region >= self._first)
-        in_media.region -= self._first
-        in_media.weight *= in_media.measure
+        if len(in_media.region):  # Dr.Jit subtracts nothing from an empty array
+            in_media.region -= self._first
+            in_media.weight *= in_media.measure
         return on_surfaces, in_media
 
     def __str__(self) -> str:
