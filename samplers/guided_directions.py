@@ -25,9 +25,9 @@ class GuidedDirectionsPlugin(DecisionPlugin):
      * - regions
        - |string|
        - What a tree of samples belongs to. :monosp:`surfaces`: a voxel and a side of the surfaces
-         in it, or a voxel of a medium; every bounce uses the tree of its place. :monosp:`tiles`: a tile of the film, as in
-         the thesis; the sample of a path's first bounce decides which tree the second uses, and so
-         on. (Default: surfaces)
+         in it, or a voxel of a medium; every bounce uses the tree of its place. :monosp:`tiles`: a
+         tile of the film, as in the thesis; the sample of a path's first bounce decides which tree
+         the second uses, and so on. (Default: surfaces)
      * - tile
        - |int|
        - Edge of a tile in pixels; accepted only with :monosp:`tiles`. (Default: 16)
