@@ -152,12 +152,13 @@ class ComposedPath(WalkIntegrator):
     :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
     :monosp:`tree`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other
     choices need a surface and refuse the scene. A guide for :monosp:`directions` also guides where
-    paths scatter in media. If the extinction of any medium differs between colours, each flight chooses the colour that samples
-    its distance in proportion to the throughput, and all colours count in its density (spectral
-    MIS, as in :monosp:`volpathmis`, in grids too). Lights at infinity should not shine into an
-    unbounded medium. With Mitsuba's :monosp:`ldsampler`, images of media have errors of 1 to 2 %,
-    also with :monosp:`volpath`. A medium that exists only inside an :monosp:`instance` is rendered,
-    but plugins that do not support media do not notice it, and therefore do not refuse the scene.
+    paths scatter in media. If the extinction of any medium differs between colours, each flight
+    chooses the colour that samples its distance in proportion to the throughput, and all colours
+    count in its density (spectral MIS, as in :monosp:`volpathmis`, in grids too). Lights at
+    infinity should not shine into an unbounded medium. With Mitsuba's :monosp:`ldsampler`, images
+    of media have errors of 1 to 2 %, also with :monosp:`volpath`. A medium that exists only inside
+    an :monosp:`instance` is rendered, but plugins that do not support media do not notice it, and
+    therefore do not refuse the scene.
 
     With :monosp:`next_event=tree`, a vertex goes down a tree over all lights, and takes a child of
     a node with a probability proportional to an estimate of what the child's lights contribute:
