@@ -1,8 +1,8 @@
 """In-scattered light where a medium is empty, for derivatives with respect to its extinction.
 
-Where σ_t = 0, no path scatters, but a little more extinction would scatter light there: the
-derivative of the radiance along a ray is ∫ T(t) σ_s'(t) L_s(t) dt and the derivative of T, where
-L_s is the in-scattered radiance. Paths that scatter in proportion to σ_t never see L_s in empty
+Where σ_t = 0, no path scatters, but a little more extinction would scatter light there. The
+derivative of the radiance along a ray has a term ∫ T(t) σ_s'(t) L_s(t) dt, where L_s is the
+in-scattered radiance. Paths that scatter in proportion to σ_t never see L_s in empty
 regions, and rarely in thin ones. So some of the paths in media of varying density take a *detour*:
 instead of flying on, they scatter at a uniform point, with the transmittance up to there. What such
 a path gathers behind that point is L_s. It is not part of the path's radiance.
@@ -18,7 +18,7 @@ proportion to the transmittance).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,7 @@ import mitsuba as mi
 from .free_flight import interaction_at
 from .media import vertex_at
 from .transmittance import ratio_tracking, stretch
-from .vertex import FlightEnd, MediumVertex
+from .vertex import FlightEnd
 
 
 @dataclass
@@ -73,7 +73,7 @@ class DetourPoint:
             si=vertex_at(end.si, self.mei, self.t, self.chosen),
             # Without the scattering coefficient
             β=dr.select(self.chosen, start.β * self.weight, end.β * self.kept),
-            in_medium=MediumVertex(scatters, mei),
+            in_medium=replace(end.in_medium, scatters=scatters, mei=mei),
         )
 
 
@@ -99,7 +99,7 @@ def detour_point(
     flies = active & (medium != None) & ~medium.is_homogeneous()  # noqa: E711
     start, length = stretch(medium, ray, end, flies)
     flies &= (length > 0) & ~detour.taken
-    # Later flights carry less: a path keeps its flights with the probabilities 3/4, 4/5, 5/6, …
+    # After n flights, 3 / (n + 3) of the paths are left
     probability = dr.rcp(mi.Float(detour.flights + 4))
     chosen = flies & (sampler.next_1d(flies) < probability)
     t = start + sampler.next_1d(chosen) * length
