@@ -36,7 +36,9 @@ def options(command: Callable) -> Callable:
     return command
 
 
-def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
+def load(
+    name: str, size: tuple[int, int], sampler: str = "", optimize: bool = True
+) -> mi.Scene:
     """A file, or one of our scenes by its name, also with parameters ("pool:lamp=0.1"), with
     another sampler than its own if that is given: "sobol_owen", or with parameters
     "sobol_owen:dimensions=2:blue_noise=true". Scenes made elsewhere call the film's size resx and
@@ -51,7 +53,7 @@ def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
         del parameters["rfilter"]
     parameters |= dict(parameter.split("=") for parameter in given)
     if not sampler:
-        return mi.load_file(str(file), **parameters)
+        return mi.load_file(str(file), optimize=optimize, **parameters)
     mi.file_resolver().prepend(str(file.parent))
     kind, *parameters_of_sampler = sampler.split(":")
     children = ""

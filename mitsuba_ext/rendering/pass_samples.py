@@ -74,11 +74,11 @@ def _sampled(
     taken = lanes.lanes(sensor.film())
     numbers = camera.draw_numbers(sensor, sampler, taken, samples)
     rays = camera.camera_rays(sensor, taken, numbers, spp)
-    return rays, estimated(estimator, scene, sampler, rays)
+    return rays, _estimated(estimator, scene, sampler, rays)
 
 
 @frozen(any_width=True)
-def estimated(
+def _estimated(
     estimator: Estimator, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays
 ) -> Sample:
     """The samples of these rays. It is recorded alone where the sensor, or what else is found along
@@ -91,6 +91,17 @@ def estimated(
     if dr.grad_enabled(sample.L):
         raise GradientsError
     return sample
+
+
+def recorded(estimator: Estimator) -> Estimator:
+    """``estimator``, recorded alone."""
+
+    def estimate(
+        scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        return _estimated(estimator, scene, sampler, rays)
+
+    return estimate
 
 
 def count_rays(tally: mi.UInt64, sample: Sample) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -29,7 +30,7 @@ from .interrupts import deferred_interrupt, interrupted
 from .mask_samples import MaskSamples
 from .pace import StageSamples, TimeLimit, plan_for_timeout
 from .pass_images import FEWEST_PASSES
-from .pass_samples import GradientsError, count_rays, estimated, look, put_samples
+from .pass_samples import GradientsError, count_rays, look, put_samples, recorded
 from .plan import plan_render, whole_warps
 from .request import Request
 from .staged import Staged
@@ -316,6 +317,8 @@ class Job:
         sampler, pixels = self._part_sampler(spp, part), self.parts[part]
         lanes = camera.PassLanes.of(self.film, spp, self.statistics.spp, pixels)
         if not self._is_frozen(stage):
+            if self._is_walk_frozen(stage) and stage.observer is None:
+                stage = replace(stage, estimator=recorded(stage.estimator))
             self._take(stage, sampler, lanes.lanes(self.film))
             return
         self._begin(stage, lanes)
@@ -378,12 +381,9 @@ class Job:
             self.masks.take(rays, count)
         if stage.observer is not None:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
-        if self._is_walk_frozen(stage) and stage.observer is None:
-            sample = estimated(stage.estimator, self.scene, sampler, rays)
-        else:
-            sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-            if dr.grad_enabled(sample.L):
-                raise GradientsError
+        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
+        if dr.grad_enabled(sample.L):
+            raise GradientsError
         aovs = sample.aovs
         if self._has_ray_aovs:
             aovs = aovs + self.integrator.sample_aovs(self.scene, sampler, rays.ray)

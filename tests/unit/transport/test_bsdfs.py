@@ -9,7 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.transport.bsdfs import bsdf_density, eval_and_sample_bsdf, eval_bsdf, sample_bsdf
+from mitsuba_ext.transport.bsdfs import (
+    bsdf_density,
+    diffuse_share,
+    eval_and_sample_bsdf,
+    eval_bsdf,
+    sample_bsdf,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -91,3 +97,42 @@ def test_everything_that_a_bsdf_returns_is_finite() -> None:
                             (same_weight, weight)]:  # fmt: skip
             assert dr.allclose(mine, other, rtol=1e-3, atol=1e-5), name
     assert "diffuse and roughconductor" in is_undefined, "Mitsuba's are finite now"
+
+
+def test_the_diffuse_share_is_the_same_however_the_whole_value_is_known() -> None:
+    """From an evaluation, from a connection, and from a sample, whose weight is value / density."""
+    rng, ctx = np.random.default_rng(4), mi.BSDFContext()
+    metal, paint = _SIMPLE["roughconductor"], {"type": "diffuse", "reflectance": 0.4}
+    kinds = {
+        "both": {"type": "blendbsdf", "weight": 0.4, "first": paint, "second": metal},
+        "two sides": {"type": "twosided", "bsdf": _SIMPLE["roughplastic"]},
+        "principled": _SIMPLE["principled"],
+    }
+    si = dr.zeros(mi.SurfaceInteraction3f, _LANES)
+    si.wi, si.sh_frame = _directions(rng), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    numbers = mi.Float(rng.random(_LANES)), mi.Point2f(rng.random((2, _LANES)))
+    for name, described in kinds.items():
+        plugin = mi.load_dict(described)
+        bsdf = mi.BSDFPtr(plugin)
+        weight = mi.Float(0.5) if name == "principled" else None
+        bs, value = sample_bsdf(bsdf, ctx, si, *numbers)
+        is_smooth = (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        evaluated, _ = eval_bsdf(bsdf, ctx, si, bs.wo)
+        shares = [
+            diffuse_share(bsdf, ctx, si, bs.wo, whole, weight)
+            for whole in (None, evaluated, value * bs.pdf)
+        ]
+        dr.eval(shares, is_smooth)  # in one kernel
+        shares = [np.array(share)[:, np.array(is_smooth)] for share in shares]
+        assert 0.05 < shares[0].mean() < 0.95, name
+        for share in shares[1:]:
+            assert np.quantile(np.abs(share - shares[0]), 0.999) < 1e-4, name
+
+
+def test_bsdfs_with_lobes_of_one_kind_are_not_divided() -> None:
+    si, wo = dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1)
+    si.wi = mi.Vector3f(0.6, 0, 0.8)
+    for name, expected in (("diffuse", 1), ("roughconductor", 0), ("roughdielectric", 0)):
+        plugin = mi.load_dict(_SIMPLE[name])
+        share = diffuse_share(mi.BSDFPtr(plugin), mi.BSDFContext(), si, wo, None, None)
+        np.testing.assert_array_equal(share, expected)

@@ -361,3 +361,14 @@ def test_recordings_keep_no_scene_alive() -> None:
     counts = [sys.getrefcount(thing) for thing in things]
     frozen.forget_recordings()
     assert [sys.getrefcount(thing) for thing in things] == counts
+
+
+def test_the_walk_is_recorded_beside_masks_and_variables_of_mitsuba() -> None:
+    scene = _scene()
+    integrator = mi.load_dict({
+        "type": "composed_path", "max_depth": 3, "aovs": "d:depth,o:object_id,c:C<R>L",
+    })  # fmt: skip
+    images = [_image(scene, integrator, seed) for seed in (1, 2)]
+    assert _recorded() == ["_estimated"]
+    for seed, image in zip((1, 2), images):
+        _assert_same(image, _traced(scene, integrator, seed))
