@@ -275,7 +275,7 @@ class PathChannels:
         Args:
             chain: The symbol of each surface, and whether there is one.
         """
-        kinds = self._chosen(vertex, wo, active)
+        kinds = self._chosen(vertex, wo, None, active)
         states = self._behind(vertex, [self._symbol(vertex, wo, kind) for kind in kinds])
         for symbol, exists in chain if self._reads else ():
             states = [
