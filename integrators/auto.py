@@ -94,8 +94,8 @@ class Auto(LightPathIntegrator):
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
     the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
     several lights by a light tree (:monosp:`next_event=tree` of :class:`composed_path`), unless it
-    saves or keeps what it learns. Learning, and compiling the kernels that it needs, would take longer than rendering
-    all samples. :monosp:`statistics.learned` then says so.
+    saves or keeps what it learns. Learning, and compiling the kernels that it needs, would take
+    longer than rendering all samples. :monosp:`statistics.learned` then says so.
     The shorter a render is, the more light paths must gain: 1.1 times the efficiency of everything
     else that was learned, and twice that efficiency in renders of half a million samples. With a
     :monosp:`timeout`, light paths are tried only if there is time to compile their kernels.

@@ -107,8 +107,8 @@ class NEEPlusPlus(WalkIntegrator):
     A first sample per pixel, which is not added to the film, finds the surfaces and the region in
     which paths scatter. The first pilot chooses among several lights by a light tree, which is kept
     if a learned table would not be much better. Otherwise each further pilot chooses its lights by
-    what the earlier pilots have learned. If these show that the gain is small, learning ends early, unless
-    :monosp:`grid` or :monosp:`rejection` is given.
+    what the earlier pilots have learned. If these show that the gain is small, learning ends early,
+    unless :monosp:`grid` or :monosp:`rejection` is given.
 
     Participating media are rendered as in :monosp:`volpath`; lights are learned for points in media
     as they are for surfaces (:monosp:`light_sampling=linear` refuses media). Gradients are not

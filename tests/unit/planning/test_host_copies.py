@@ -41,4 +41,5 @@ def test_no_copy_of_learned_lights_grows_with_the_film(copied: list[int]) -> Non
         assert "less variance" in integrator.statistics.learned
         largest.append(max(copied))
         total.append(sum(copied))
-    assert max(largest) < 4096 and max(total) < 100_000, (largest, total)
+    # A light tree is built on the host
+    assert max(largest) < 65_536 and total[1] < 1.1 * total[0] < 1_000_000, (largest, total)
