@@ -57,9 +57,10 @@ def cells(integrator: dict[str, Any]) -> list[str]:
 @click.option("--seeds", default=3, help="Renders of each integrator.")
 @click.option("--size", type=(int, int), default=(160, 90), help="Of the film.")
 @click.option("--reference-spp", default=1024, help="Samples per pixel of references.")
+@click.option("--reference", default="", help="Their integrator; sppm or composed_path by default.")
 def main(
     names: tuple[str, ...], kinds: tuple[str, ...], spp: int, seeds: int, size: tuple[int, int],
-    reference_spp: int,
+    reference_spp: int, reference: str,
 ) -> None:  # fmt: skip
     """Compares integrators in the scenes of these NAMES (all by default)."""
     mi.set_variant("llvm_ad_rgb")
@@ -69,8 +70,8 @@ def main(
         comparison = compare.Comparison(
             compare.SceneSetup(source, size, changes=compare.SceneChanges(None, "box", 8)),
             kinds, compare.equal_samples(spp or SPP.get(name, 256)), seeds, FOLDER / name,
-            _REFERENCE_SPP.get(name, reference_spp),
-            "sppm" if name in _BY_PHOTONS else "composed_path", cpu_time=True,
+            reference_spp if reference else _REFERENCE_SPP.get(name, reference_spp),
+            reference or ("sppm" if name in _BY_PHOTONS else "composed_path"), cpu_time=True,
         )  # fmt: skip
         for integrator in comparison.run()["scenes"][0]["integrators"]:
             print_row([name, integrator["label"], *cells(integrator)])

@@ -97,16 +97,27 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
     sample a border, there is no light image. Lights of type :monosp:`directionalarea`, which
     :monosp:`path` does not find, are rendered, but spectral variants refuse them.
 
-    Participating media are refused, because the light paths do not scatter in them (use
-    :monosp:`sppm`, :monosp:`composed_path` or :monosp:`volpath`). Gradients are not supported (use
-    :monosp:`prb`); neither are scalar and polarized variants, nor nesting in :monosp:`moment` and
-    :monosp:`aov`.
+    **Participating media.** The image is the same as with :monosp:`volpath`. Light paths scatter in
+    homogeneous and grid media, and connections pass through media, index-matched surfaces and
+    masks. The MIS weights contain the transmittance of homogeneous media; grid media count as empty
+    in the weights only. A light is taken to lie in the medium on its side of the closest boundary,
+    in the direction of each light path; outside all boundaries, in the medium behind the last
+    boundary that a ray from the sensor crosses. Lights at infinity are refused if that medium is
+    not a vacuum, and so is :monosp:`subpath_selection=visibility`. The parameter
+    ``sample_emitters`` of media is ignored: all their vertices are connected. Where light gets no
+    deeper than the offset at which rays start (10⁻⁴ · (1 + the largest coordinate)), the image is
+    brighter than with :monosp:`volpath`, and both are too dark.
+
+    Gradients are not supported (use :monosp:`prb`); neither are scalar and polarized variants, nor
+    nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
     chapter 10; D. Cline, PhD thesis, 2007, sections 7.6 and 7.9; I. Georgiev, *Implementing Vertex
     Connection and Merging*, technical report, 2012 (weights); J. Guo, M. Eisemann, E. Eisemann,
     *Next Event Estimation++*, Computer Graphics Forum 39(7), 2020, section 4.3 (selection by
-    visibility; the regions of surfaces, the contributions, and the counts in the weights are ours).
+    visibility; the regions of surfaces, the contributions, and the counts in the weights are ours);
+    E. Lafortune, Y. Willems, *Rendering Participating Media with Bidirectional Path Tracing*,
+    Eurographics Workshop on Rendering, 1996.
 
     .. tabs::
         .. code-tab:: xml

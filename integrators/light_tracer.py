@@ -6,6 +6,7 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.lens import LENS_SAMPLING, connectable, connectable_sensor
+from mitsuba_ext.estimators.light_paths.light_media import outside_of
 from mitsuba_ext.estimators.light_paths.light_side import light_emission
 from mitsuba_ext.estimators.light_paths.light_tracer import LightTracer
 from mitsuba_ext.estimators.light_paths.light_walk import LightWalk
@@ -15,6 +16,7 @@ from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.device import SampleBytes
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.scene.bsdfs import refuse_clear_curves
+from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import sensor_at_rest
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
@@ -52,11 +54,11 @@ class LightTracerIntegrator(WalkIntegrator):
     thousand times its size); the page of :class:`bdpt` explains why.
 
     **What it cannot see.** A vertex cannot be connected to the sensor via a mirror, or through
-    glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through smooth
-    glass, through a hole of a mask or through a null surface, is black; a warning says so if the
-    scene has such materials. Emitters that the camera sees directly are rendered. Lights of type
-    :monosp:`directionalarea`, which :monosp:`path` does not find, are also rendered (spectral
-    variants refuse them).
+    glass, masks and null surfaces (in scenes with media, the last two let light pass). Whatever the
+    camera sees in a smooth mirror, through smooth glass, through a hole of a mask or through a null
+    surface, is black; a warning says so if the scene has such materials. Emitters that the camera
+    sees directly are rendered. Lights of type :monosp:`directionalarea`, which :monosp:`path` does
+    not find, are also rendered (spectral variants refuse them).
 
     **Sensors and films.** The sensor must be a :monosp:`perspective`, :monosp:`thinlens` or
     :monosp:`orthographic`; others, such as a :monosp:`batch`, are refused. The film must be an
@@ -78,9 +80,11 @@ class LightTracerIntegrator(WalkIntegrator):
     maps, filters at the film's edges. With the sampler :monosp:`ldsampler`, whose numbers depend on
     each other, light paths draw independent random numbers instead.
 
-    Alpha and output variables come from the camera rays. Participating media are refused (use
-    :monosp:`volpath` or :monosp:`composed_path`), and so are curves whose BSDF transmits light,
-    such as :monosp:`hair` (use :class:`bdpt`). Gradients are not supported (use
+    Alpha and output variables come from the camera rays. Participating media are rendered as in
+    :monosp:`volpath`, with the exceptions that the page of :class:`bdpt` lists; in scenes that have
+    any, vertices are connected to the sensor through index-matched surfaces and masks as well.
+    Curves whose BSDF transmits light, such as :monosp:`hair`, are refused (use :class:`bdpt`).
+    Gradients are not supported (use
     :class:`composed_prb`); neither are scalar and polarized variants, nor nesting in
     :monosp:`moment` and :monosp:`aov`.
 
@@ -101,7 +105,7 @@ class LightTracerIntegrator(WalkIntegrator):
             'max_depth': 8
     """
 
-    has_light_paths = True
+    has_light_paths = light_paths_see_media = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -142,8 +146,10 @@ class LightTracerIntegrator(WalkIntegrator):
             self._warn_of_hidden(scene)
             emission = light_emission(self.name, scene)
             walk = LightWalk(
-                emission, self.max_depth, self.rr_depth, query=query, channels=self.channels
-            )
+                emission, self.max_depth, self.rr_depth, query=query,
+                outside=outside_of(self.name, query, scene, sensor), connects=True,
+                channels=self.channels,
+            )  # fmt: skip
             target = connectable_sensor(self.name, self.lens_sampling, scene, sensor, query)
         directly = Walk(
             min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query,
@@ -154,12 +160,16 @@ class LightTracerIntegrator(WalkIntegrator):
     def _warn_of_hidden(self, scene: mi.Scene) -> None:
         """Warns of surfaces that are black; only once, because this is called for every batch of a
         render."""
-        hidden = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
+        hidden = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+        masks = ", and through masks and null surfaces"
+        if may_have_media(scene):
+            masks = ""
+        else:
+            hidden |= int(mi.BSDFFlags.Null)
         is_there = any(s.bsdf() and int(s.bsdf().flags()) & hidden for s in scene.shapes())
         if is_there and not self._has_warned:
             self._has_warned = True
             mi.Log(
                 mi.LogLevel.Warn,
-                f'"{self.name}": what the camera sees in mirrors, through glass, and through masks '
-                f"and null surfaces, is black.",
+                f'"{self.name}": what the camera sees in mirrors, through glass{masks}, is black.',
             )

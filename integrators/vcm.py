@@ -67,8 +67,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     the same time: otherwise the vertices of other paths could not be merged. Errors of colour and
     motion blur are then the same in all pixels; they fall faster than noise.
 
-    Participating media are refused, because the light paths do not scatter in them (use
-    :monosp:`sppm`, :monosp:`composed_path` or :monosp:`volpath`). The parameter
+    With merging, participating media are refused (use :monosp:`sppm`, :class:`bdpt` or
+    :monosp:`composed_path`). The parameter
     ``technique_images`` of :class:`bdpt` is refused with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with

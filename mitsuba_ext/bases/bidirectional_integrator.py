@@ -18,6 +18,7 @@ from ..estimators.light_paths.bidirectional_programs import LightSums
 from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
+from ..estimators.light_paths.light_media import outside_of
 from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.light_walk import LightWalk
 from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers
@@ -81,6 +82,7 @@ class LightPathIntegrator(WalkIntegrator):
     def connects_to(self, scene: mi.Scene, sensor: mi.Sensor) -> bool:
         """Whether all lights of the scene can emit light paths, and the sensor receives them."""
         try:
+            outside_of(self.name, self.query(scene), scene, sensor)
             return LightSide.of(self.name, scene, sensor).sensor is not None
         except NotImplementedError:
             return False
@@ -97,7 +99,8 @@ class LightPathIntegrator(WalkIntegrator):
                 film, *film_extent(film), self.max_depth, device_of(mi.Float).pass_bytes
             )
         radius = Once(functools.partial(self.merging_radius, request, side))
-        return LightPathEstimators(self, side, radius, self.techniques)
+        outside = outside_of(self.name, self.query(scene), scene, request.sensor)
+        return LightPathEstimators(self, side, radius, self.techniques, outside)
 
     def merging_radius(
         self,
@@ -165,12 +168,14 @@ class LightPathEstimators:
         side: The lights and the sensor.
         radius: Within what radius vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
         images: Receives the contributions of all techniques; ``None`` if nothing does.
+        outside: See :class:`LightWalk`.
     """
 
     integrator: LightPathIntegrator
     side: LightSide
     radius: Callable[..., MergingRadius | None]
     images: TechniqueImages | None = None
+    outside: mi.MediumPtr | None = None
 
     def __call__(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
         integrator, side = self.integrator, self.side
@@ -199,7 +204,7 @@ class LightPathEstimators:
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
             merges_all=integrator.merges_all, light_paths=techniques.light_paths,
-            most_lanes=device_of(mi.Float).lanes(sample_bytes),
+            most_lanes=device_of(mi.Float).lanes(sample_bytes), outside=self.outside,
         )  # fmt: skip
 
 
@@ -208,6 +213,10 @@ class BidirectionalIntegrator(LightPathIntegrator):
     """A :class:`LightPathIntegrator` with the parameters of :class:`bdpt`."""
 
     has_light_paths = True
+
+    @property
+    def light_paths_see_media(self) -> bool:
+        return self.merging is None
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -436,13 +436,13 @@ class WalkIntegrator(StagedIntegrator):
         if self.has_light_paths and not self.light_paths_see_media:
             refuse_media(
                 scene, f'"{self.name}", whose light paths do not scatter in a medium,',
-                'use "sppm", "composed_path" or "volpath"',
+                'use "bdpt", "sppm", "composed_path" or "volpath"',
             )  # fmt: skip
         if not self.sees_media:
             refuse_media(scene, f'"{self.name}"', 'use "composed_path" or "volpath"')
         for slot, parameters in self.slots.items():
             if not parameters.sees_media:
                 what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
-                default = next(iter(SLOTS[slot]))
+                default = next(iter({**SLOTS, **BIDIRECTIONAL_SLOTS}[slot]))
                 refuse_media(scene, what, f'choose another one, such as "{default}"')
         refuse_moving_grids(scene, f'"{self.name}"')

@@ -33,28 +33,29 @@ def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
     cannot render everything in the scene.
 
     ===================================  ========================================================
+    light that no camera path finds      ``bdpt``, where it can render the scene
     media                                ``volpath``, or ``composed_path`` if their extinction is
                                          coloured (``volpathmis`` loses light behind roulette)
-    light that no camera path finds      ``bdpt``, where it can render the scene
     ``moving`` or lightweight shapes     ``composed_path``, if none of the others is chosen
     ===================================  ========================================================
     """
     scene = loaded.scene
     missed = _missed_light(scene, loaded.has_media)
+    if missed and _takes_light_paths(loaded):
+        why = f'"bdpt" renders the reference: no camera path finds {missed}'
+        if "smooth" in missed:
+            other = "sppm" if loaded.has_media else "vcm"
+            why += (
+                "; where such light is seen in a mirror, or through glass, the reference still "
+                f'lacks it ("{other}" has it, slightly blurred)'
+            )
+        return ReferenceChoice("bdpt", (why,))
+    lacks = _lacks(missed, '"bdpt" cannot render this scene')
     if loaded.has_media:
         by_us = extinction_varies(scene) or has_unseen_shapes(scene)
         name = "composed_path" if by_us else "volpath"
         why = f'"{name}" renders the reference: the scene has participating media'
-        return ReferenceChoice(name, (why, *_lacks(missed, '"bdpt" does not see media')))
-    if missed and _takes_light_paths(loaded):
-        why = f'"bdpt" renders the reference: no camera path finds {missed}'
-        if "smooth" in missed:
-            why += (
-                "; where such light is seen in a mirror, or through glass, the reference still "
-                'lacks it ("vcm" has it, slightly blurred)'
-            )
-        return ReferenceChoice("bdpt", (why,))
-    lacks = _lacks(missed, '"bdpt" cannot render this scene')
+        return ReferenceChoice(name, (why, *lacks))
     if has_unseen_shapes(scene):
         why = '"composed_path" renders the reference: the scene has shapes that "path" does not see'
         return ReferenceChoice("composed_path", (why, *lacks))

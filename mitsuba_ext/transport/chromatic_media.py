@@ -56,14 +56,18 @@ class ChromaticMedia(Media):
 
 
 def media_of(
-    scene: mi.Scene, hide_emitters: bool, distances: Distances, is_chromatic: bool
+    scene: mi.Scene,
+    hide_emitters: bool,
+    distances: Distances,
+    is_chromatic: bool,
+    connects_all: bool = False,
 ) -> NoMedia:
     """The object that handles the media of ``scene``. ``is_chromatic`` tells whether their
-    extinction may vary between colours."""
+    extinction may vary between colours; see :class:`Media` for the other parameters."""
     if not may_have_media(scene):
         return NoMedia(hide_emitters)
     kind = ChromaticMedia if is_chromatic else Media
-    return kind(hide_emitters, distances, may_have_grids(scene))
+    return kind(hide_emitters, distances, may_have_grids(scene), connects_all)
 
 
 def chosen_rate(σ: mi.UnpolarizedSpectrum, channel: mi.UInt32) -> mi.Float:

@@ -24,6 +24,7 @@ from .path_decisions import (
 )
 from .path_program import PathProgram
 from .replay import FirstPass
+from .transmittance import for_weights
 from .vertex import PathState, Vertex
 
 #: The golden ratio: its multiples, modulo one, are evenly spread.
@@ -132,9 +133,9 @@ class Connector:
         """
         si, ds, local_value = vertex.si, connection.ds, bsdf_value
         bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
-        mis = self._program.connection(
-            self._weights, self._scene, vertex, ds, count * ds.pdf, pdf
-        )
+        mis: mi.Float | float = 1.0
+        if not self._program.weighs_transmittance:
+            mis = self._mis(vertex, ds, count * ds.pdf, pdf)
         contribution = bsdf_value * connection.weight
         value = β * contribution * mis
         considered = active & (ds.pdf != 0)
@@ -147,10 +148,13 @@ class Connector:
         weight, tested, state = self._roulette(state, connection, survival_sample, si, tested)
         value *= weight
         if self._media.exist:
-            T, way = self._media.transmittance(
+            T, known, way = self._media.transmittance(
                 self._query, self._scene, vertex, ds, inside, self._replay is not None, sampler,
                 tested,
             )  # fmt: skip
+            if self._program.weighs_transmittance:
+                # What finds the light otherwise flies all the way, with this probability
+                value *= self._mis(vertex, ds, count * ds.pdf / for_weights(known), pdf)
             value, contribution = value * T, contribution * T
             visible = tested & (dr.max(T) > 0)
         else:
@@ -164,6 +168,12 @@ class Connector:
             connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )
         return value, considered, tested, visible, state
+
+    def _mis(self, vertex: Vertex, ds, pdf, scattering_pdf) -> mi.Float:
+        """The MIS weight of a connection to a light."""
+        return self._program.connection(
+            self._weights, self._scene, vertex, ds, pdf, scattering_pdf
+        )
 
     def survival_sample(self, sampler: mi.Sampler) -> mi.Float | None:
         """The number that decides whether a connection is tested; ``None`` if all are."""

@@ -27,6 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..util.arrays import channel_mean
 from .estimator import CameraRays
 from .free_flight import Distances, attenuation, component, extinction, interaction_at, track
 from .hidden_emitters import behind_emitters
@@ -161,6 +162,8 @@ class Media(NoMedia):
         hide_emitters: Whether lights are invisible to rays that nothing has scattered yet.
         distances: Draws the random numbers that choose distances.
         has_grids: Whether there may be media that are not homogeneous.
+        connects_all: Whether vertices are connected to lights also in media that switch emitter
+            sampling off.
     """
 
     exist = True
@@ -168,9 +171,16 @@ class Media(NoMedia):
     # ``volpath`` traces. A ray that misses the boundary of a medium never sees the medium
     coherent = False
 
-    def __init__(self, hide_emitters: bool, distances: Distances, has_grids: bool = True) -> None:
+    def __init__(
+        self,
+        hide_emitters: bool,
+        distances: Distances,
+        has_grids: bool = True,
+        connects_all: bool = False,
+    ) -> None:
         super().__init__(hide_emitters)
         self._distances, self._has_grids = distances, has_grids
+        self._connects_all = connects_all
 
     def begin(self, sampler, rays):
         channel = mi.UInt32(0)
@@ -209,6 +219,7 @@ class Media(NoMedia):
         σ = extinction(inside.medium, ray, is_homogeneous)
         scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
         t = dr.minimum(inside.reach, si.t)
+        flown = t
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` draws whether the collision is real
@@ -222,7 +233,9 @@ class Media(NoMedia):
             )
             scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
-        return vertex_at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
+        # Costs nothing where it is not used
+        attenuated = dr.select(is_homogeneous, channel_mean(attenuation(σ, flown)), 1)
+        return vertex_at(si, mei, t, scatters), β, MediumVertex(scatters, mei, attenuated)
 
     def _rate(self, σ, inside):
         """The extinction ``σ`` with which the distance of a flight is sampled."""
@@ -253,9 +266,13 @@ class Media(NoMedia):
         counts = vertex.depth + 1 < max_depth
         may_pass = mi.has_flag(flags, mi.BSDFFlags.Null)
         goes_on = active & vertex.si.is_valid() & (counts | may_pass)
-        connects = in_medium.scatters & in_medium.mei.medium.use_emitter_sampling()
+        connects = in_medium.scatters & self._connects(in_medium.mei.medium)
         connects |= mi.has_flag(flags, mi.BSDFFlags.Smooth)
         return goes_on, goes_on & counts & connects
+
+    def _connects(self, medium: mi.MediumPtr) -> mi.Bool:
+        """Whether vertices in ``medium`` are connected to lights."""
+        return mi.Bool(True) if self._connects_all else medium.use_emitter_sampling()
 
     def turns(self, vertex, active):
         is_matched = vertex.bsdf.flags() & mi.UInt32(+mi.BSDFFlags.All) == +mi.BSDFFlags.Null
@@ -271,9 +288,9 @@ class Media(NoMedia):
 
     def transmittance(
         self, query, scene, vertex: Vertex, ds, inside, finds_way: bool, sampler, active
-    ) -> tuple[mi.Spectrum, Way | None]:
-        """The transmittance between ``vertex`` and the light sample ``ds``; see
-        :func:`transmittance`."""
+    ) -> tuple[mi.Spectrum, mi.Float, Way | None]:
+        """The transmittance between ``vertex`` and the light sample ``ds``, and the part of it that
+        is known; see :func:`transmittance`."""
         return transmittance(
             query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids,
             self._distances.exact_transmittance, finds_way, sampler, active,
@@ -293,7 +310,7 @@ class Media(NoMedia):
         bs.pdf = dr.select(scatters, pdf, bs.pdf)
         bs.eta = dr.select(scatters, 1, bs.eta)
         is_smooth = dr.select(
-            mei.medium.use_emitter_sampling(),
+            self._connects(mei.medium),
             mi.UInt32(+mi.BSDFFlags.DiffuseTransmission),
             # No connection finds light in this direction
             mi.UInt32(+mi.BSDFFlags.DeltaTransmission),

@@ -49,6 +49,26 @@ class Numbers(Protocol):
 
 
 @dataclass
+class HashedNumbers:
+    """Numbers by a hash.
+
+    Attributes:
+        word: Chooses the sequence of a lane.
+        index: How many numbers it has drawn.
+    """
+
+    word: mi.UInt32
+    index: mi.UInt32
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        return self.next_2d(active).x
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        self.index = self.index + 1
+        return hashed_2d(self.word, self.index)
+
+
+@dataclass
 class BothEnds:
     """Numbers of a bidirectional path, one sequence for each subpath: the numbers of the camera
     subpath do not depend on how many the light subpath draws.

@@ -44,7 +44,7 @@ from ..util.spectra import to_rgb
 from .bsdfs import diffuse_share
 from .estimator import CameraRays
 from .heroes import Heroes
-from .vertex import PathState, Vertex
+from .vertex import MediumVertex, PathState, Vertex
 
 #: The kinds of lobes, in the order of the alphabet's symbols, and their number.
 _DIFFUSE, _GLOSSY, _SPECULAR, _KINDS = 0, 1, 2, 3
@@ -209,9 +209,12 @@ class PathChannels:
         self, vertex: Any, to_camera: mi.Vector3f, active: mi.Bool
     ) -> list[mi.UInt32]:
         """The state of a light path behind its last ``vertex``, in the direction in which it is
-        connected. ``vertex`` is a stored one, on a surface."""
+        connected. ``vertex`` is a stored one."""
         path = PathState(*[None] * 6, events=vertex.events)
         at = Vertex(vertex.si, vertex.si.bsdf(), path)
+        if vertex.medium is not None:
+            in_medium = vertex.si.shape == None  # noqa: E711
+            at.medium = MediumVertex(in_medium, dr.zeros(mi.MediumInteraction3f))
         if self._backs == 1:
             return vertex.events
         reverse, wo = _reversed(at, to_camera), vertex.si.wi

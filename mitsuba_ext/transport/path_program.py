@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .path_decisions import Roulette, Weights
-from .vertex import PathState, Vertex
+from .vertex import MediumVertex, PathState, Vertex
 
 
 class Subpaths:
@@ -50,10 +50,15 @@ class PathProgram:
     Attributes:
         subpaths: The other subpaths; ``None`` if there are none.
         ends_early: Whether :meth:`survival` may end paths before ``rr_depth``.
+        weighs_transmittance: Whether MIS weights contain the probability with which a path passes
+            through homogeneous media. :meth:`connection` then receives the density of connections
+            divided by this probability.
+        connects_all: Whether vertices in media are connected to lights even if the medium switches
+            that off.
     """
 
     subpaths: Subpaths | None = None
-    ends_early = False
+    ends_early = weighs_transmittance = connects_all = False
 
     # ---- The history ----
 
@@ -61,9 +66,11 @@ class PathProgram:
         """The history before the first vertex."""
         return None
 
-    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
+    def arrive(
+        self, path: PathState, si: mi.SurfaceInteraction3f, in_medium: MediumVertex | None
+    ) -> Any:
         """The history at the vertex ``si``. ``path`` has the history that :meth:`leave` returned at
-        the previous vertex."""
+        the previous vertex. ``in_medium`` is the part of the vertex that concerns media."""
         return path.history
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..util.arrays import channel_mean
 from .free_flight import attenuation, component, extinction, interaction_at
 from .path_decisions import SceneQuery
 
@@ -47,6 +48,11 @@ def stretch(
     return dr.select(is_inside, start, 0), dr.select(is_inside, length, 0)
 
 
+def for_weights(transmittance: mi.Float) -> mi.Float:
+    """A known transmittance as MIS weights contain it: never so small that its square is zero."""
+    return dr.maximum(transmittance, 1e-12)
+
+
 @dr.syntax
 def transmittance(
     query: SceneQuery,
@@ -60,11 +66,16 @@ def transmittance(
     finds_way: bool,
     sampler: mi.Sampler,
     active: mi.Bool,
-) -> tuple[mi.Spectrum, Way | None]:
+    passes_emitters: bool = False,
+) -> tuple[mi.Spectrum, mi.Float, Way | None]:
     """An unbiased estimate of the transmittance between a vertex and a point on a light. In
     homogeneous media, it is computed, or estimated with a random distance; in others, it is
     estimated by ratio tracking (Novák et al., section 4.2). It is 0 where a surface that is not
     index-matched lies in between.
+
+    The second result is the transmittance of the homogeneous media alone, as the product of the
+    means over the colours in each of them. It does not depend on random numbers, so MIS weights can
+    contain it (:attr:`.MediumVertex.attenuation` is the same along a path).
 
     Parameters:
         query: How rays intersect the scene.
@@ -73,12 +84,13 @@ def transmittance(
         has_grids: Whether there may be media that are not homogeneous.
         exact: Whether the transmittance of homogeneous media is computed without random distances.
         finds_way: Whether the :class:`Way` of the light is returned as well.
+        passes_emitters: Whether area lights let light pass, because they are hidden.
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
     # Media attenuate light from infinity up to Mitsuba's ds.p; surfaces block it at any distance
     left = query.starts.towards(si, ds.p, ds.n).maxt
-    T = mi.Spectrum(1)
+    T, known = mi.Spectrum(1), mi.Float(1)
     way = Way(dr.zeros(mi.MediumInteraction3f), mi.Float(0)) if finds_way else None
     active = mi.Bool(active)
     while dr.hint(active, label="transmittance"):
@@ -95,6 +107,7 @@ def transmittance(
         # ----- Attenuation up to the next surface, or to the light -----
         T = dr.select(collides & ~is_met, 0, T)
         T = dr.select(is_homogeneous, T * attenuation(rate, end), T)
+        known = dr.select(is_homogeneous, known * channel_mean(attenuation(σ, end)), known)
         if dr.hint(has_grids, mode="scalar"):
             T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
         if dr.hint(finds_way, mode="scalar"):
@@ -102,17 +115,21 @@ def transmittance(
         # ----- Does the surface let it pass? -----
         met = query.interaction(pi, segment)
         is_met &= dr.max(T) > 0
-        passing = met.bsdf(segment).eval_null_transmission(met, is_met)
-        T = dr.select(is_met, T * mi.Spectrum(passing), T)
+        passing = mi.Spectrum(met.bsdf(segment).eval_null_transmission(met, is_met))
+        is_hidden = mi.Bool(False)
+        if dr.hint(passes_emitters, mode="scalar"):
+            is_hidden = met.shape.emitter() != None  # noqa: E711
+            passing = dr.select(is_hidden, 1, passing)
+        T = dr.select(is_met, T * passing, T)
         is_met &= dr.max(T) > 0
-        crosses = is_met & met.is_medium_transition()
+        crosses = is_met & met.is_medium_transition() & ~is_hidden
         medium = dr.select(crosses, met.target_medium(ray.d), medium)
         onward = query.starts.along(met, ray.d)
         onward.maxt = ray.maxt - met.t
         ray = dr.select(is_met, onward, ray)
         left = dr.select(is_met, left - met.t, left)
         active &= is_met & (ray.maxt > 0)
-    return T, way
+    return T, known, way
 
 
 def _flight(

@@ -60,11 +60,15 @@ class MediumVertex:
 
     Attributes:
         scatters: Whether the path scatters in a medium. Elsewhere, its vertex is on a surface.
-        mei: The interaction there, without the coefficients of the medium.
+        mei: The interaction there, without the coefficients of the medium. On a surface, it still
+            has the medium through which the path has arrived.
+        attenuation: The transmittance of the homogeneous medium on the way from the previous vertex
+            or index-matched surface, as the mean over the colours; 1 for other media.
     """
 
     scatters: mi.Bool
     mei: mi.MediumInteraction3f
+    attenuation: mi.Float | None = None
 
 
 @dataclass

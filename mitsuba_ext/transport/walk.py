@@ -130,7 +130,10 @@ class Walk:
         can_hit_emitters = has_emitters and can_be_hit(scene)
         sees_environment = scene.environment() is not None and not self.hide_emitters
 
-        media = media_of(scene, self.hide_emitters, self.distance, self.query.has_chromatic_media)
+        media = media_of(
+            scene, self.hide_emitters, self.distance, self.query.has_chromatic_media,
+            self.program.connects_all,
+        )  # fmt: skip
         heroes = Heroes(scene, rays.hero_weight)
         ctx = heroes.context()
         connector = Connector(
@@ -183,7 +186,7 @@ class Walk:
             if dr.hint(replays_media, mode="scalar"):
                 start = FlightEnd(si, path.β, None)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
-            path.history = self.program.arrive(path, si)
+            path.history = self.program.arrive(path, si, in_medium)
 
             if dr.hint(replays_media, mode="scalar"):
                 end, detour, active = self.replay.flown(

@@ -23,8 +23,8 @@ class WithoutLengths(PathProgram):
     def begin(self, ray):
         return self._program.begin(ray)
 
-    def arrive(self, path, si):
-        return self._program.arrive(path, si)
+    def arrive(self, path, si, in_medium):
+        return self._program.arrive(path, si, in_medium)
 
     def leave(self, vertex, bs):
         return self._program.leave(vertex, bs)

@@ -15,12 +15,10 @@ from mitsuba_ext.estimators.light_paths.bidirectional_programs import (
 from mitsuba_ext.estimators.light_paths.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.estimators.light_paths.emission import EmittedRay, LightEmission
 from mitsuba_ext.estimators.light_paths.lens import connectable
+from mitsuba_ext.estimators.light_paths.medium_programs import BidirectionalProgramInMedia
+from mitsuba_ext.estimators.light_paths.medium_scattering import MediumTerms
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, weight
-from mitsuba_ext.estimators.light_paths.scattering import (
-    cosine_of_delta,
-    geometric_cosine,
-    reverse_density,
-)
+from mitsuba_ext.estimators.light_paths.scattering import SurfaceTerms, cosine_of_delta
 from mitsuba_ext.estimators.light_paths.sensor import ConnectableSensor
 from mitsuba_ext.transport.connection import emission
 from mitsuba_ext.transport.path_decisions import (
@@ -29,12 +27,12 @@ from mitsuba_ext.transport.path_decisions import (
     SubpathSelection,
     Weights,
 )
-from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
+from mitsuba_ext.transport.vertex import Arrival, MediumVertex, PathState, Vertex
 
 
 @dataclass
 class PathVertex:
-    """A vertex on a surface.
+    """A vertex on a surface, or in a medium.
 
     Attributes:
         p, n: Position and geometric normal.
@@ -51,6 +49,7 @@ class PathVertex:
     bsdf: mi.BSDFPtr
     is_delta: mi.Bool
     η: mi.Float
+    medium: mi.MediumPtr | None = None
 
 
 @dataclass
@@ -62,12 +61,15 @@ class Paths:
         vertices: From light to camera.
         camera_ray: The ray of the camera.
         active: The lanes that have a path.
+        transmittance: For each segment, from light to camera, what weights know of it; ``None``
+            without media.
     """
 
     emitted: EmittedRay
     vertices: list[PathVertex]
     camera_ray: mi.Ray3f
     active: mi.Bool
+    transmittance: list[mi.Float] | None = None
 
 
 def trace(
@@ -131,6 +133,51 @@ def trace(
     return paths
 
 
+def trace_in_medium(
+    scene: mi.Scene, emission: LightEmission, sensor: mi.Sensor, count: int, lanes: int = 1024
+) -> Paths:
+    """Paths whose ``count`` vertices all lie in the medium of the sensor, with any transmittances.
+    """
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(7, lanes)
+    active = mi.Bool(True)
+    emitted = emission.sample(numbers, mi.Float(0), mi.Ray3f().wavelengths, active)
+    active &= dr.max(emitted.weight) > 0
+    medium = dr.full(mi.MediumPtr, sensor.get_medium(), lanes)
+    d, p, places = emitted.ray.d, emitted.start.p, []
+    start = dr.select(emitted.is_infinite, 2 * mi.Point3f(numbers.next_1d(), 0, 0) - d, p)
+    for _ in range(count):
+        start = start + d * (0.2 + numbers.next_1d())
+        places.append(start)
+        d = mi.warp.square_to_uniform_sphere(numbers.next_2d())
+    dr.eval(emitted, places)
+    last = dr.zeros(mi.SurfaceInteraction3f, lanes)
+    last.p = places[-1]
+    connection, _ = ConnectableSensor(sensor).connect(last, numbers.next_2d(), active)
+    active &= connection.active
+    ends = [places[0] - emitted.ray.d, *places, places[-1] + connection.d]
+    vertices = []
+    for before, at, behind in zip(ends, ends[1:], ends[2:]):
+        sides = []
+        for other in (before, behind):
+            si = dr.zeros(mi.SurfaceInteraction3f, lanes)
+            si.p, si.t = at, dr.zeros(mi.Float, lanes)
+            si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
+            si.wi = dr.normalize(other - at)
+            sides.append(si)
+        vertices.append(PathVertex(
+            at, mi.Normal3f(0), *sides, dr.zeros(mi.BSDFPtr, lanes), mi.Bool(False), mi.Float(1),
+            medium,
+        ))  # fmt: skip
+    first = vertices[0].from_light
+    first.t = dr.select(emitted.is_infinite, 1, dr.norm(first.p - emitted.start.p))
+    passed = [0.1 + 0.9 * numbers.next_1d() for _ in range(count + 1)]
+    camera_ray = mi.Ray3f(connection.target, -connection.d)
+    paths = Paths(emitted, vertices, camera_ray, active, passed)
+    dr.eval(paths)
+    return paths
+
+
 def _walk(scene, numbers, ray, count, active, mode):
     """The interactions, the directions that were chosen there, whether these are discrete, and the
     relative index of refraction."""
@@ -168,17 +215,20 @@ def weights_of_techniques(
     find the path; which of the lanes have a path; and for all techniques but the first two the
     ratios of the densities of these to its own, and the squared ratios of other connections and of
     the light image, [s − 2, 4, path]."""
+    terms = SurfaceTerms() if paths.transmittance is None else MediumTerms(False)
     sums = PartialSums(
-        CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS
+        CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS, terms=terms
     )
     active = paths.active
-    program, weights = BidirectionalProgram(scene, sums, emits, sensor), Weights()
+    passed = paths.transmittance or [1.0] * (len(paths.vertices) + 1)
+    kind = BidirectionalProgramInMedia if terms.sees_media else BidirectionalProgram
+    program, weights = kind(scene, sums, emits, sensor), Weights()
     ctx = mi.BSDFContext()
     vertices, emitted = paths.vertices, paths.emitted
 
     # ----- Subpaths from the light -----
     si = vertices[0].from_light
-    first = LightSums(sums, next_event).at_first(scene, emitted, si, active)
+    first = LightSums(sums, next_event).at_first(scene, emitted, si, active, passed[0])
     at_first = mi.Bool(True)
     arrived = sums.arrive(first, si, mi.Float(1), at_first, by_light=True)
     by_light = [
@@ -186,21 +236,22 @@ def weights_of_techniques(
     ]
     # Which techniques scatter only where their densities are not 0
     from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
-    for a, b in zip(vertices, vertices[1:]):
+    for a, b, T in zip(vertices, vertices[1:], passed[1:]):
         si, wo = a.from_light, a.from_camera.wi
-        pdf = dr.select(a.is_delta, 1, a.bsdf.pdf(ctx, si, wo, active))
+        pdf = dr.select(a.is_delta, 1, terms.density(ctx, a.bsdf, si, a.medium, wo, active))
         from_light.append(from_light[-1] & (pdf > 0))
         bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
         bs.eta = a.η
-        cosine = dr.select(a.is_delta, cosine_of_delta(si, bs), geometric_cosine(si, wo))
+        cosine = dr.select(a.is_delta, cosine_of_delta(si, bs), terms.cosine(si, wo))
         left = sums.leave(
             by_light[-1], cosine, pdf,
-            reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta, a is vertices[0],
+            terms.reverse_density(ctx, a.bsdf, si, a.medium, wo, active), a.is_delta,
+            a is vertices[0],
             by_light=True,
         )  # fmt: skip
         by_light.append(
             sums.arrive(
-                left, b.from_light, dr.squared_norm(b.p - a.p), ~at_first, by_light=True
+                left, b.from_light, dr.squared_norm(b.p - a.p) / T, ~at_first, by_light=True
             )
         )
 
@@ -212,14 +263,19 @@ def weights_of_techniques(
     )  # fmt: skip
     by_camera: list[Vertex] = []
     state = next_event.begin(None, paths.camera_ray)
-    for v in reversed(vertices):
-        si = v.from_camera
-        path.history = program.arrive(path, si)
-        vertex = Vertex(si, v.bsdf, path)
+    for v, T in zip(reversed(vertices), reversed(passed)):
+        si, in_medium = v.from_camera, None
+        if v.medium is not None:
+            mei = dr.zeros(mi.MediumInteraction3f, dr.width(si))
+            mei.medium = v.medium
+            in_medium = MediumVertex(mi.Bool(True), mei, T)
+        path.history = program.arrive(path, si, in_medium)
+        vertex = Vertex(si, v.bsdf, path, None, in_medium)
         by_camera.insert(0, vertex)
         bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
         bs.wo, bs.eta = v.from_light.wi, dr.rcp(v.η)
-        bs.pdf = dr.select(v.is_delta, 1, v.bsdf.pdf(ctx, si, bs.wo, active))
+        bs.pdf = terms.density(ctx, v.bsdf, si, v.medium, bs.wo, active)
+        bs.pdf = dr.select(v.is_delta, 1, bs.pdf)
         from_camera.insert(0, from_camera[0] & (bs.pdf > 0))
         delta, smooth = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DiffuseReflection)
         bs.sampled_type = dr.select(v.is_delta, mi.UInt32(delta), mi.UInt32(smooth))
@@ -250,7 +306,11 @@ def weights_of_techniques(
             hits["weight"] = program.emission(*arguments)
             return hits["weight"]
 
-    path.history = program.arrive(path, si)
+    in_medium = None
+    if paths.transmittance is not None:
+        mei = dr.zeros(mi.MediumInteraction3f)
+        in_medium = MediumVertex(mi.Bool(False), mei, passed[0])
+    path.history = program.arrive(path, si, in_medium)
     emission(scene, SceneQuery(), si, path, next_event, state, weights, Record())
     found.append(dr.select(is_hit, hits["weight"], 0))
 
@@ -263,16 +323,20 @@ def weights_of_techniques(
     ds.emitter = emitted.emitter
     ds.delta = is_delta_light
     ds.pdf = dr.select(is_hit, hits["pdf"], probability)
-    by_scattering = first.bsdf.pdf(ctx, first.from_camera, first.from_light.wi, active)
-    connected = program.connection(weights, scene, by_camera[0], ds, ds.pdf, by_scattering)
+    by_scattering = terms.density(
+        ctx, first.bsdf, first.from_camera, first.medium, first.from_light.wi, active
+    )
+    connected = program.connection(
+        weights, scene, by_camera[0], ds, ds.pdf / passed[0], by_scattering
+    )
     found.append(dr.select(first.is_delta, 0, connected))
 
     # ----- s, t ≥ 2 -----
     ratios = []
     for i, (a, b) in enumerate(zip(vertices, vertices[1:])):
         ends = [
-            End(si, wo, v.bsdf.pdf(ctx, si, wo, active),
-                reverse_density(ctx, v.bsdf, si, wo, active), partial)
+            End(si, wo, terms.density(ctx, v.bsdf, si, v.medium, wo, active),
+                terms.reverse_density(ctx, v.bsdf, si, v.medium, wo, active), partial)
             for v, si, wo, partial in (
                 (b, b.from_camera, b.from_light.wi, by_camera[i + 1].path.history),
                 (a, a.from_light, a.from_camera.wi, by_light[i]),
@@ -283,12 +347,13 @@ def weights_of_techniques(
             expected = selection.expected(
                 by_camera[i + 1].path.history.region, by_light[i].region, active
             )
-        joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p), expected)
+        squared_distance = dr.squared_norm(b.p - a.p) / passed[i + 1]
+        joined = joining_weight(sums, *ends, squared_distance, expected)
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
         factor = 1 / (CONNECTIONS * expected)
         is_first = b is vertices[-1], i == 0
         competing = joining_rivals(
-            sums, *ends, dr.squared_norm(b.p - a.p), is_first, factor, expected
+            sums, *ends, squared_distance, is_first, factor, expected
         )
         ratios.append([*competing.by_camera, *competing.by_kind])
 
@@ -298,8 +363,8 @@ def weights_of_techniques(
         origin, pdf = sensor.origin(paths.camera_ray)
         wo = last.from_camera.wi
         spread = 1 if sensor.is_parallel else dr.squared_norm(last.p - origin)
-        density = pdf / spread * geometric_cosine(last.from_light, wo)
-        reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
+        density = pdf / spread * terms.cosine(last.from_light, wo) * passed[-1]
+        reverse = terms.reverse_density(ctx, last.bsdf, last.from_light, last.medium, wo, active)
         seen = weight(sums.others(density, by_light[-1], reverse) / sums.image_count)
         found.append(dr.select(last.is_delta, 0, seen))
         ends = density, by_light[-1], reverse, len(vertices) == 1

@@ -78,6 +78,86 @@ def fog_around_the_camera(light: str = "point", medium: Scene | None = None) -> 
             "sensor": eye, "fog": ball}  # fmt: skip
 
 
+def leaves_and_windows() -> Scene:
+    """What lets rays pass without turning them: half transparent and thin glass."""
+    T = mi.ScalarTransform4f
+    leaf = {"type": "mask", "opacity": 0.4, "bsdf": diffuse(0.6)}
+    window = {"type": "rectangle", "to_world": T().translate([0, 0, 1.6]).scale(1.5),
+              "bsdf": {"type": "thindielectric"}}  # fmt: skip
+    return fog("area", fog=cube(homogeneous(), bsdf=leaf), window=window)
+
+
+def empty_cloud() -> Scene:
+    """A grid with holes: the density is zero there."""
+    density = np.zeros((4, 4, 4, 1), dtype=np.float32)
+    density[::2, 1:3, ::2] = 6.0
+    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density),
+              "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}  # fmt: skip
+    return fog("point", {"type": "heterogeneous", "sigma_t": volume, "albedo": 0.9})
+
+
+def mixed() -> Scene:
+    """Media that meet, glass and a half transparent leaf in them, under lights of several kinds."""
+    scene = fog_around_the_camera("area", homogeneous([0.1, 0.15, 0.2], 0.9))
+    around = {"type": "ref", "id": "around"}
+    T = mi.ScalarTransform4f
+    leaf = {"type": "rectangle", "to_world": T().translate([0.5, 1, 0.5]).rotate([1, 0, 0], 70),
+            "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": diffuse(0.6)}}  # fmt: skip
+    return {
+        **scene,
+        "outer": cube(homogeneous(0.8, 0.9, 0.9), 0.9, exterior=around),
+        "inner": cube(homogeneous(2.0, 0.9, -0.5), 0.4,
+                      exterior=homogeneous(0.8, 0.9, 0.9)),
+        "ball": {"type": "sphere", "radius": 0.5, "center": [1.6, -0.6, 0.8],
+                 "bsdf": {"type": "roughdielectric", "alpha": 0.3}, "exterior": around},
+        "leaf": leaf,
+        "spot": {"type": "spot", "intensity": 20.0, "to_world": lookat([-2, 2, 3], [0, 0, 0],
+                 [0, 1, 0])},
+        "sky": {"type": "constant", "radiance": 0.1},
+    }  # fmt: skip
+
+
+def glass_in_fog() -> Scene:
+    """A ball of glass in fog."""
+    ball = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"},
+            "exterior": {"type": "ref", "id": "around"}}  # fmt: skip
+    return {**fog_around_the_camera("area", homogeneous(0.2)), "ball": ball}
+
+
+def without_boundary() -> Scene:
+    """Fog everywhere: only the sensor knows of it."""
+    scene = {k: v for k, v in fog("area_inside").items() if k != "fog"}
+    return {**scene, "sensor": {**scene["sensor"], "medium": homogeneous(0.1)}}
+
+
+SCENES = {
+    "lamp_outside": lambda: fog("area"),
+    "lamp_inside": lambda: fog("area_inside"),
+    "point_inside": lambda: fog("point_inside"),
+    "sky": lambda: fog("environment"),
+    "sun": lambda: fog("directional"),
+    "chromatic": lambda: fog("area", homogeneous([0.2, 0.5, 0.9], [0.9, 0.6, 0.3])),
+    "forward": lambda: fog("area", homogeneous(g=0.8)),
+    "backward": lambda: fog("area", homogeneous(g=-0.6)),
+    "thick": lambda: fog("area", homogeneous(8.0, 0.95)),
+    "grid": lambda: fog("area", grid()),
+    "around_the_camera": lambda: fog_around_the_camera("area_inside", homogeneous(0.2)),
+    "without_boundary": without_boundary,
+    "nested": lambda: fog("area", inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
+    "without_emitter_sampling": lambda: fog("area", homogeneous(sample_emitters=False)),
+    "glass_in_fog": glass_in_fog,
+}
+
+#: More of them, with what makes media hard.
+HARD_SCENES = {
+    "leaves": leaves_and_windows,
+    "empty_cloud": empty_cloud,
+    "white": lambda: fog("area", homogeneous(1.0, 1.0)),
+    "black": lambda: fog("area", homogeneous(1.0, 0.0)),
+    "mixed": mixed,
+}
+
+
 def _medium(kind: str, g: float, **parameters: Any) -> Scene:
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
     colours = {k: rgb(*v) if isinstance(v, list) else v for k, v in parameters.items()}

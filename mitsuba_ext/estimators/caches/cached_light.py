@@ -53,7 +53,7 @@ class CachedPaths(EndingProgram):
     def begin(self, ray):
         return Progress(mi.UInt32(SHARP), dr.zeros(mi.Float, dr.width(ray)))
 
-    def arrive(self, path, si):
+    def arrive(self, path, si, in_medium):
         before = path.history
         return Progress(before.phase, before.length + dr.select(si.is_valid(), si.t, 0))
 
@@ -156,9 +156,9 @@ class IndirectOnly(PathProgram):
         self._lane = dr.arange(mi.UInt32, lanes)
         dr.eval(self.distance, self._lane)
 
-    def arrive(self, path, si):
+    def arrive(self, path, si, in_medium):
         dr.scatter(self.distance, si.t, self._lane, (path.depth == 0) & si.is_valid())
-        return super().arrive(path, si)
+        return super().arrive(path, si, in_medium)
 
     def emission(self, weights, scene, si, ds, path, pdf):
         weight = super().emission(weights, scene, si, ds, path, pdf)

@@ -3,6 +3,8 @@ weights, and how the sums are stored."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -13,8 +15,8 @@ from ...transport.vertex import PathState, Vertex
 from .choice.technique_observer import TechniqueObserver
 from .emission import EmittedRay, LightEmission
 from .light_program import LightProgram, StoredHistory
-from .partial_sums import PartialSums, Sums, arrival_cosine, weight
-from .scattering import cosine_of_delta, geometric_cosine, reverse_density
+from .partial_sums import PartialSums, Sums, weight
+from .scattering import cosine_of_delta
 from .sensor import ConnectableSensor
 
 
@@ -60,13 +62,25 @@ class BidirectionalProgram(PathProgram):
         dVCM = self.sums.image_count * self.sums.ratio(dr.rcp(pdf))
         return self.sums.begin(dVCM, dr.zeros(mi.Float, dr.width(pdf)))
 
-    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
+    def arrive(self, path, si, in_medium) -> Sums:
+        return self._arrived(path, si, self._squared_distance(path, si))
+
+    def _squared_distance(self, path: PathState, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """The squared distance of ``si`` from the previous vertex, or from the point of the
+        aperture where the path begins. It is 1 where the sensor's rays are parallel."""
         is_first = path.depth == 0
         ref = dr.select(is_first, self._origin, path.arrival.ref.p)
         squared = dr.squared_norm(si.p - ref)
         if self._sensor is not None and self._sensor.is_parallel:
             squared = dr.select(is_first, 1, squared)
-        later = self.sums.arrive(path.history, si, squared, is_first, by_light=False)
+        return squared
+
+    def _arrived(
+        self, path: PathState, si: mi.SurfaceInteraction3f, squared_distance: mi.Float
+    ) -> Sums:
+        """The sums at the vertex ``si``; see :meth:`PartialSums.arrive`."""
+        is_first = path.depth == 0
+        later = self.sums.arrive(path.history, si, squared_distance, is_first, by_light=False)
         # A ray that hits nothing keeps its density per solid angle
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.history.dVCM),
@@ -110,7 +124,7 @@ class BidirectionalProgram(PathProgram):
         emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)
         inverse = dr.select(active, dr.rcp(pdf), 0)
         sums = vertex.path.history
-        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+        reverse = self._reverse_density(vertex, wo, active)
         others = self.sums.others(emitted * inverse, sums, reverse)
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
         if self._observer is not None:
@@ -125,8 +139,8 @@ class BidirectionalProgram(PathProgram):
         si = vertex.si
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         active = si.is_valid() & ~is_delta
-        reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
-        cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
+        reverse = self._reverse_density(vertex, bs.wo, active)
+        cosine = dr.select(is_delta, cosine_of_delta(si, bs), self.sums.terms.cosine(si, bs.wo))
         cosine = dr.select(self.sums.is_open(si, bs.wo), cosine, 0)
         sums = self.sums.leave(
             vertex.path.history, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0,
@@ -143,6 +157,12 @@ class BidirectionalProgram(PathProgram):
             merges = si.is_valid() & is_delta & (vertex.depth > 0) & (squared > 0)
             sums.dVC += dr.select(merges, self.sums.ratio(cosine) * before, 0)
         return sums
+
+    def _reverse_density(self, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """The density with which a light path that arrives from ``wo`` goes on along the path."""
+        medium = vertex.medium and vertex.medium.mei.medium
+        terms = self.sums.terms
+        return terms.reverse_density(self._ctx, vertex.bsdf, vertex.si, medium, wo, active)
 
 
 class StoredSums(StoredHistory):
@@ -188,17 +208,27 @@ class LightSums(LightProgram):
         return self.at_first(scene, emitted, query.interaction(pi, emitted.ray), active)
 
     def at_first(
-        self, scene: mi.Scene, emitted: EmittedRay, si: mi.SurfaceInteraction3f, active: mi.Bool
+        self,
+        scene: mi.Scene,
+        emitted: EmittedRay,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+        transmittance: mi.Float | float = 1.0,
     ) -> Sums:
-        """The sums at the first vertex after the light, ``si``."""
+        """The sums at the first vertex after the light, ``si``. ``transmittance`` is the known
+        transmittance of the segment."""
         is_delta = emitted.is_delta_position | emitted.is_delta_direction
         chosen = emitted.probability * emitted.pdf_position * emitted.pdf_direction
         # Densities per area, at the vertex (``arrives``) and at the light (``leaves``)
-        arrives = chosen * arrival_cosine(si) / dr.select(emitted.is_infinite, 1, dr.square(si.t))
+        arrives = chosen * self._sums.terms.cosine(si, si.wi)
+        arrives /= dr.select(emitted.is_infinite, 1, dr.square(si.t))
         connected = self._connection_density(scene, emitted, si, active)
         leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
         connected *= dr.select(is_delta, 1, leaves)
         inverse = dr.select(arrives > 0, dr.rcp(arrives), 0)
+        if self._sums.terms.sees_media:
+            # Emitted rays fly all the way; connections need not
+            connected /= transmittance
         sums = self._sums.begin(
             self._sums.ratio(connected * inverse),
             dr.select(is_delta, 0, self._sums.ratio(leaves * inverse)),
@@ -232,8 +262,8 @@ class LightSums(LightProgram):
         probability = next_event.probability(state, scene, ref, emitted.index, active & is_delta)
         return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
 
-    def arrive(self, history: Sums, si, depth) -> Sums:
-        is_first = depth == 1
+    def arrive(self, history: Sums, vertex: Vertex, start: Any) -> Sums:
+        si, is_first = vertex.si, vertex.depth == 1
         later = self._sums.arrive(history, si, dr.square(si.t), is_first, by_light=True)
         return Sums(
             dr.select(is_first, history.dVCM, later.dVCM),
@@ -250,7 +280,7 @@ class LightSums(LightProgram):
 
     def leave(self, history: Sums, vertex, bs, reverse_pdf, passes) -> Sums:
         si = vertex.si
-        cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
+        cosine = dr.select(passes, cosine_of_delta(si, bs), self._sums.terms.cosine(si, bs.wo))
         return self._sums.leave(
             history, cosine, bs.pdf, reverse_pdf, passes, vertex.depth == 1, by_light=True
         )

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.bsdfs import bsdf_density, eval_bsdf
 from ...transport.heroes import Heroes
+from ...transport.numbers import Numbers
 from ...transport.observer import Observer
 from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import SceneQuery
 from ...transport.path_program import Subpaths
+from ...transport.transmittance import for_weights
 from ...transport.vertex import Vertex
 from .choice.technique_observer import TechniqueObserver
 from .light_vertices import VertexCache
 from .partial_sums import CompetingDensities, PartialSums, Sums, weight
-from .scattering import adjoint_value, geometric_cosine, reverse_density
 from .vertex_choice import VertexChoice
 
 
@@ -47,11 +47,16 @@ def joining_weight(
     squared_distance: mi.Float,
     expected: mi.Float | float = 1.0,
 ) -> mi.Float:
-    """The MIS weight of connecting two subpaths. ``expected`` is :meth:`SubpathSelection.expected`,
-    if a selection chooses the vertices."""
+    """The MIS weight of connecting two subpaths.
+
+    Parameters:
+        squared_distance: In participating media, divided by the known transmittance: all other
+            techniques pass the segment with this probability.
+        expected: :meth:`SubpathSelection.expected`, if a selection chooses the vertices.
+    """
     inverse = dr.rcp(squared_distance)
     to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
-    to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
+    to_other = one.pdf * sums.terms.cosine(other.si, other.wo) * inverse
     others = sums.others(to_one, one.sums, one.reverse_pdf)
     others += sums.others(to_other, other.sums, other.reverse_pdf)
     return weight(others / (sums.count * sums.ratio(expected)))
@@ -77,7 +82,7 @@ def joining_rivals(
     """
     inverse = dr.rcp(squared_distance)
     to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
-    to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
+    to_other = one.pdf * sums.terms.cosine(other.si, other.wo) * inverse
     ends = to_other, other.sums, other.reverse_pdf, is_first[1]
     kinds = sums.by_kind(*ends, by_light=True)
     kinds += sums.by_kind(to_one, one.sums, one.reverse_pdf, is_first[0], by_light=False)
@@ -127,27 +132,23 @@ class LightSubpaths(Subpaths):
     def gather(self, scene, sampler, vertex, active):
         total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
         if dr.hint(self._connections == 1, mode="scalar"):
-            total, shadow_count = self._connect(
-                scene, self._choice.numbers(sampler), vertex, active
-            )
+            total, shadow_count = self._connect(scene, sampler, vertex, active)
         else:
             index = mi.UInt32(0)
             while index < self._connections:
-                value, tested = self._connect(
-                    scene, self._choice.numbers(sampler), vertex, active
-                )
+                value, tested = self._connect(scene, sampler, vertex, active)
                 total += value
                 shadow_count += tested
                 index += 1
         return total, shadow_count
 
     def _connect(
-        self, scene: mi.Scene, numbers: tuple[mi.Point2f, ...], vertex: Vertex, active: mi.Bool
+        self, scene: mi.Scene, sampler: Numbers, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """Connects ``vertex`` to a light path vertex that ``numbers`` choose. Returns the
+        """Connects ``vertex`` to a light path vertex that random numbers choose. Returns the
         contribution, and the number of shadow rays."""
         considered = active
-        chosen = self._choice.choose(numbers, vertex, active)
+        chosen = self._choice.choose(self._choice.numbers(sampler), vertex, active)
         active, factor = chosen.active, chosen.factor * self._share
         other = self._vertices.at(chosen.index, active)
         # Segments of the path: the segments of both subpaths, and one that connects them
@@ -160,12 +161,16 @@ class LightSubpaths(Subpaths):
         d /= dr.select(active, distance, 1)
         wo, back = si.to_local(d), far.to_local(-d)
         active &= self._sums.is_open(far, back)
+        terms = self._sums.terms
+        medium = vertex.medium and vertex.medium.mei.medium
 
         # ----- Throughput of the connection -----
-        near_value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
+        near_value, pdf = terms.eval(self._ctx, vertex.bsdf, si, medium, wo, active)
         value = si.to_world_mueller(near_value, -wo, si.wi)
         far_bsdf = far.bsdf()
-        far_value, far_reverse = adjoint_value(self._ctx, far_bsdf, far, back, active)
+        far_value, far_reverse = terms.adjoint(
+            self._ctx, far_bsdf, far, other.medium, back, active
+        )
         value = self._heroes.join(
             (vertex.path.hero_is_alone, value, vertex.bsdf, si, wo),
             (other.hero_is_alone, far_value, far_bsdf, far, back),
@@ -173,20 +178,33 @@ class LightSubpaths(Subpaths):
         value *= vertex.path.β * other.β * (factor / dr.select(active, squared_distance, 1))
 
         # ----- MIS weight -----
-        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        far_pdf = bsdf_density(far_bsdf, self._ctx, far, back, active)
+        reverse = terms.reverse_density(self._ctx, vertex.bsdf, si, medium, wo, active)
+        far_pdf = terms.density(self._ctx, far_bsdf, far, other.medium, back, active)
         near_end = End(si, wo, pdf, reverse, vertex.path.history)
         far_end = End(far, back, far_pdf, far_reverse, other.history)
-        mis = joining_weight(
-            self._sums, near_end, far_end, squared_distance, chosen.expected
-        )
-        value *= mis
+        mis: mi.Float | float = 1.0
+        if not terms.sees_media:
+            mis = joining_weight(
+                self._sums, near_end, far_end, squared_distance, chosen.expected
+            )
+            value *= mis
 
         # ----- Shadow ray -----
         active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
         ds.p, ds.n, ds.d, ds.dist = far.p, far.n, d, distance
-        visible = active & ~self._query.occluded(scene, si, ds, active)
+        if terms.sees_media:
+            T, known = terms.transmittance(
+                self._query, scene, si, medium, ds, sampler, active
+            )
+            squared_distance /= for_weights(known)
+            mis = joining_weight(
+                self._sums, near_end, far_end, squared_distance, chosen.expected
+            )
+            value *= T * mis
+            visible = active & (dr.max(T) > 0) & dr.all(dr.isfinite(value))
+        else:
+            visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._channels is not None:
             others = self._channels.past(other, back, visible)

@@ -8,14 +8,15 @@ import mitsuba as mi
 from ...transport.estimator import CameraRays, Splats
 from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
-from ...transport.numbers import Numbers, hashed_2d
+from ...transport.numbers import HashedNumbers, Numbers, hashed_2d
 from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import SceneQuery
+from ...transport.transmittance import for_weights
 from .choice.technique_observer import TechniqueObserver
-from .light_vertices import VertexCache
+from .light_vertices import LightVertex, VertexCache
 from .partial_sums import CompetingDensities, PartialSums, weight
-from .scattering import evaluate, geometric_cosine
-from .sensor import ConnectableSensor, is_occluded
+from .scattering import SurfaceTerms
+from .sensor import ConnectableSensor, SensorConnection, is_occluded
 
 
 class LightImage:
@@ -25,7 +26,8 @@ class LightImage:
     The sum of a pixel's splats, divided by the number of its camera samples, is their contribution
     to the pixel's radiance.
 
-    It draws one random number if the sensor has an aperture, and none otherwise.
+    It draws one random number if the sensor has an aperture, or if a medium varies in density, and
+    none otherwise.
 
     Parameters:
         scene: The scene.
@@ -40,6 +42,7 @@ class LightImage:
         observer: Receives the splats.
         light_paths: Number of light paths for each camera path.
         channels: Divides the splats among light path expressions; ``None`` without any.
+        terms: The terms of vertices.
 
     Attributes:
         shadow_count: Number of shadow rays traced.
@@ -58,8 +61,9 @@ class LightImage:
         observer: TechniqueObserver | None = None,
         light_paths: float = 1.0,
         channels: PathChannels | None = None,
+        terms: SurfaceTerms = SurfaceTerms(),  # noqa: B008  (never modified)
     ) -> None:
-        self._channels = channels
+        self._channels, self._terms = channels, terms
         self._share = dr.opaque(mi.Float, 1 / light_paths)
         self._least_depth = least_depth
         self._observer = observer
@@ -67,9 +71,9 @@ class LightImage:
         self._sums, self._query = sums, query or SceneQuery()
         self._hides_emitters = hides_emitters
         # Hashed with the depth of a vertex, it gives the numbers that choose a point of the
-        # aperture
+        # aperture, and collisions in media of varying density
         self._seed = None
-        if sensor.needs_aperture_sample:
+        if sensor.needs_aperture_sample or (terms.sees_media and terms.has_grids):
             self._seed = mi.UInt32(numbers.next_1d() * 4294967040.0)
             dr.schedule(self._seed)
         dr.schedule(self._importance)
@@ -80,7 +84,7 @@ class LightImage:
         return (
             self._least_depth, self._scene, self._sensor, self._importance, self._sums,
             self._query, self._hides_emitters, self._seed, self._share, self._observer,
-            self._channels,
+            self._channels, self._terms,
         )  # fmt: skip
 
     def splats(self, vertices: VertexCache) -> Splats:
@@ -99,7 +103,7 @@ class LightImage:
         vertex = vertices.at(index, active)
         si = vertex.si
         sample = mi.Point2f(0.5)
-        if self._seed is not None:
+        if self._sensor.needs_aperture_sample:
             word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
             sample = hashed_2d(word, vertex.depth)
         connection, lens_weight = self._sensor.connect(si, sample, active)
@@ -110,17 +114,25 @@ class LightImage:
             active &= si.shape.emitter() == None  # noqa: E711
         to_camera = si.to_local(connection.d)
         heroes = Heroes(self._scene)
-        value, reverse_pdf = evaluate(
-            heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
+        terms, bsdf = self._terms, si.bsdf()
+        value, reverse_pdf = terms.adjoint(
+            heroes.context(), bsdf, si, vertex.medium, to_camera, active
         )
+        value = heroes.connect(vertex.hero_is_alone, value, bsdf, si, to_camera)
         importance = connection.importance * lens_weight
         value *= vertex.β * (importance * self._share)
-        mis, competing = mi.Float(1), None
+        mis, competing, T = mi.Float(1), None, None
+        # Transmittance comes first, since weights depend on it
+        if terms.sees_media:
+            active &= dr.max(dr.abs(value)) > 0
+            T, known = self._transmittance(vertex, connection, active)
         if self._sums is not None:
             active &= self._sums.is_open(si, to_camera)
             # The density per area with which a camera ray finds the vertex, divided by the density
             # of this point of the aperture
-            found = importance * geometric_cosine(si, to_camera)
+            found = importance * terms.cosine(si, to_camera)
+            if terms.sees_media:
+                found *= for_weights(known)
             others = self._sums.others(found, vertex.history, reverse_pdf)
             mis = weight(others / self._sums.image_count)
             if self._sums.splits:
@@ -131,9 +143,13 @@ class LightImage:
         # A connection that cannot contribute needs no shadow ray
         active &= dr.max(dr.abs(value)) > 0
         tested = mi.UInt32(dr.select(active, 1, 0))
-        active &= ~is_occluded(
-            self._query, self._scene, si, connection, active, self._hides_emitters
-        )
+        if terms.sees_media:
+            value *= T
+            active &= dr.max(T) > 0
+        else:
+            active &= ~is_occluded(
+                self._query, self._scene, si, connection, active, self._hides_emitters
+            )
         if not isinstance(self._importance, float):
             importance = self._importance
             if dr.width(importance) > 1:
@@ -154,3 +170,16 @@ class LightImage:
         ), tested  # fmt: skip
 
     _connect_frozen = frozen(_connect)
+
+    def _transmittance(
+        self, vertex: LightVertex, connection: SensorConnection, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """The transmittance between a vertex and the sensor, and the part of it that is known."""
+        numbers = None
+        if self._seed is not None:
+            word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
+            numbers = HashedNumbers(word ^ (vertex.depth << 16), mi.UInt32(0))
+        return self._terms.transmittance(
+            self._query, self._scene, vertex.si, vertex.medium, connection.direction_sample(),
+            numbers, active, self._hides_emitters,
+        )  # fmt: skip

@@ -10,6 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ...scene.media import may_have_media
 from ...transport.path_decisions import SceneQuery
 from .emission import EmittedRay
 
@@ -47,6 +48,31 @@ def medium_at_start(
         has_turned |= turns
         searches &= turns | (is_met & ~knows)
     return medium
+
+
+def outside_of(
+    plugin: str, query: SceneQuery, scene: mi.Scene, sensor: mi.Sensor
+) -> mi.MediumPtr | None:
+    """:func:`outer_medium` of a scene whose light paths are connected; ``None`` if the scene has no
+    media.
+
+    Parameters:
+        plugin: The plugin's name in error messages.
+
+    Raises:
+        NotImplementedError: A light at infinity shines through a medium that has no boundary.
+    """
+    if not may_have_media(scene):
+        return None
+    outside = outer_medium(query, scene, sensor)
+    infinite = [e for e in scene.emitters() if mi.has_flag(e.flags(), mi.EmitterFlags.Infinite)]
+    if infinite and dr.any(outside != None):  # noqa: E711
+        raise NotImplementedError(
+            f'"{plugin}": the light "{infinite[0].class_name()}" shines from infinity, through a '
+            f'participating medium that nothing bounds: enclose the medium in a shape with the '
+            f'BSDF "null", or use "composed_path"'
+        )
+    return outside
 
 
 def outer_medium(query: SceneQuery, scene: mi.Scene, sensor: mi.Sensor) -> mi.MediumPtr:

@@ -62,9 +62,9 @@ class LightProgram:
         """The history at the first vertex after the light, where ``emitted`` hits ``pi``."""
         return None
 
-    def arrive(self, history: Any, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> Any:
-        """The history at the vertex ``si``; ``history`` is from :meth:`leave` at the previous
-        vertex, or from :meth:`first`."""
+    def arrive(self, history: Any, vertex: Vertex, start: EmittedRay | None) -> Any:
+        """The history at ``vertex``; ``history`` is from :meth:`leave` at the previous vertex, or
+        from :meth:`first`. ``start`` is the ray with which the path began, in scenes with media."""
         return history
 
     def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool | bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...scene.media import may_have_grids
 from ...transport.estimator import CameraRays, Sample, Splats
 from ...transport.numbers import Numbers
 from ...transport.walk import Walk
@@ -14,6 +15,8 @@ from ...util.arrays import joined
 from .light_image import LightImage
 from .light_numbers import LightPathRays
 from .light_walk import LightWalk
+from .medium_scattering import MediumTerms
+from .scattering import SurfaceTerms
 from .sensor import ConnectableSensor
 
 
@@ -39,9 +42,13 @@ class LightTracer:
         if self.light_walk is None:
             return sample
         walk = self.light_walk
+        terms = SurfaceTerms()
+        if walk.outside is not None:
+            terms = MediumTerms(may_have_grids(scene))
         image = LightImage(
             scene, self.sensor, sampler, rays, query=walk.query,
             hides_emitters=self.directly.hide_emitters, channels=walk.channels,
+            terms=terms,
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read them again
         dr.schedule(sample, rays.ray.wavelengths)

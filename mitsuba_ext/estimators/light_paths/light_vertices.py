@@ -34,16 +34,18 @@ class Layout:
         history: How the history of the path is stored.
         is_whole: Whether all fields of the interaction are stored.
         events: Words of the state of light path expressions.
+        has_medium: Whether the medium in which the vertex lies is stored.
     """
 
     spectrum: int
     history: StoredHistory
     is_whole: bool
     events: int = 0
+    has_medium: bool = False
 
     @property
     def words(self) -> int:
-        return -(-(self.state + self.events) // _PACKET) * _PACKET
+        return -(-(self.state + self.events + self.has_medium) // _PACKET) * _PACKET
 
     @property
     def state(self) -> int:
@@ -92,8 +94,9 @@ class VertexStore:
         hero_is_alone: mi.Bool | None,
         active: mi.Bool,
         events: list[mi.UInt32] | None = None,
+        inside: Any = None,
     ) -> None:
-        """Writes a vertex."""
+        """Writes a vertex. ``inside`` is the state of the path in participating media."""
         mark = mi.UInt32(depth)
         if hero_is_alone is not None:
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
@@ -103,6 +106,8 @@ class VertexStore:
         words = [*β, *stored.words(history), as_float(mark)]
         words += to_words(si, self.layout.is_whole)
         words += [as_float(state) for state in events or ()]
+        if self.layout.has_medium:
+            words.append(as_float(inside.medium))
         words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), place, active)
 
@@ -140,6 +145,8 @@ class LightVertex:
             light.
         lane: The number of the light path.
         events: The state of light path expressions at the vertex; ``None`` without any.
+        medium: The participating medium in which the light has arrived; ``None`` if it is not
+            stored.
     """
 
     si: mi.SurfaceInteraction3f
@@ -149,6 +156,7 @@ class LightVertex:
     hero_is_alone: mi.Bool | None
     lane: mi.UInt32
     events: list[mi.UInt32] | None = None
+    medium: mi.MediumPtr | None = None
 
 
 class VertexCache:
@@ -267,7 +275,14 @@ class VertexCache:
         β = mi.Spectrum(*(w[i] for i in range(n)))
         states = range(layout.state, layout.state + layout.events)
         events = [dr.reinterpret_array(mi.UInt32, w[i]) for i in states] or None
-        return LightVertex(si, β, history, depth, hero_is_alone, lane, events)
+        medium = None
+        if layout.has_medium:
+            medium = dr.reinterpret_array(
+                mi.MediumPtr, dr.reinterpret_array(mi.UInt32, w[states.stop])
+            )
+            # A point without a normal has no words for it
+            si.n = dr.select(si.shape == None, 0, si.n)  # noqa: E711
+        return LightVertex(si, β, history, depth, hero_is_alone, lane, events, medium)
 
     def position(self, index: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         """The positions of the vertices with these indices."""

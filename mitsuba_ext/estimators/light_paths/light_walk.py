@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -54,6 +54,8 @@ class LightPaths:
         inside: The state between two vertices (``transport/media.py``); ``None`` without media.
         active: Paths that have not ended.
         events: The state of light path expressions; ``None`` without any.
+        start: The rays with which the paths began, if ``LightWalk.program`` needs them in scenes
+            with media.
     """
 
     ray: mi.Ray3f
@@ -68,6 +70,7 @@ class LightPaths:
     inside: Any
     active: mi.Bool
     events: list[mi.UInt32] | None = None
+    start: EmittedRay | None = None
 
 
 @dataclass
@@ -93,6 +96,8 @@ class LightWalk:
             this is ``None``, a smooth lobe. ``program`` treats other vertices as specular.
         outside: In scenes with media, the medium outside of all boundaries (:func:`outer_medium`);
             ``None`` if paths should pass through media as if through a vacuum.
+        connects: Whether stored vertices are connected: the throughput at a vertex in a medium then
+            contains the coefficient of scattering, which photons do not have.
         channels: Reads the events of the paths for light path expressions; ``None`` without any.
     """
 
@@ -104,6 +109,7 @@ class LightWalk:
     query: SceneQuery = field(default_factory=SceneQuery)
     stored_lobes: int | None = None
     outside: mi.MediumPtr | None = None
+    connects: bool = False
     channels: PathChannels | None = None
 
     @property
@@ -111,7 +117,8 @@ class LightWalk:
         """The layout of the stored vertices."""
         is_whole = self.emission.needs_whole_interaction
         events = 0 if self.channels is None else self.channels.colours
-        return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole, events)
+        has_medium = self.outside is not None and self.connects
+        return Layout(dr.size_v(mi.Spectrum), self.program.stored, is_whole, events, has_medium)
 
     def run(
         self,
@@ -234,6 +241,8 @@ class LightWalk:
             paths.events = self.channels.begin_light(emitted.emitter)
         if paths.hero_is_alone is not None:
             paths.hero_is_alone = dr.zeros(mi.Bool, width)
+        if self.outside is not None and self.program.is_weighed:
+            paths.start = emitted
         return paths
 
     @dr.syntax
@@ -248,20 +257,22 @@ class LightWalk:
         rr_depth = dr.opaque(mi.UInt32, self.rr_depth)
         # A copy: the loop's mask is not the paths' mask
         active = mi.Bool(paths.active)
+        # No part of the loop's state, since it does not change
+        start, paths = paths.start, replace(paths, start=None)
 
         while dr.hint(active, label="light walk"):
             si = self.query.interaction(paths.pi, paths.ray)
             si, β, in_medium = media.fly(paths.inside, numbers, paths.ray, si, paths.β, active)
             bsdf = si.bsdf(paths.ray)
             vertex = Vertex(si, bsdf, paths, None, in_medium)
-            history = self.program.arrive(paths.history, si, paths.depth)
+            history = self.program.arrive(paths.history, vertex, start)
             stores = self._stores(bsdf)
 
             # ----- Store the vertex if it can be connected -----
             is_stored = active & self._is_stored(media, vertex, stores)
             store.write(
-                place, si, paths.emitted * media.arriving(β, vertex), history, paths.depth,
-                paths.hero_is_alone, is_stored, paths.events,
+                place, si, paths.emitted * self._carried(media, β, vertex), history, paths.depth,
+                paths.hero_is_alone, is_stored, paths.events, paths.inside,
             )  # fmt: skip
             place += dr.select(is_stored, 1, 0)
 
@@ -269,10 +280,12 @@ class LightWalk:
             active_next = self._goes_on(media, vertex, last_depth, active)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
             bs, weight = directions.sample(bsdf, ctx, si, sample_1, sample_2, active_next)
-            weight, history, hero_count, hero_is_alone = self._scatter(
-                heroes, vertex, bs, weight, history, stores, active_next
+            weight, reverse_pdf, hero_count, hero_is_alone = self._scatter(
+                heroes, vertex, bs, weight, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | ~stores
+            history = self.program.leave(history, vertex, bs, reverse_pdf, passes)
             events = self.channels and self.channels.left_by_light(vertex, bs, active_next)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
@@ -303,6 +316,7 @@ class LightWalk:
                 scatter_count, inside, active_next, events,
             )  # fmt: skip
             active = active_next & (place < end)
+        paths = replace(paths, start=start)
         return numbers, paths, store.finish(place, paths.active)
 
     def _directions(self) -> LightDirections:
@@ -314,7 +328,8 @@ class LightWalk:
         """The object that handles media."""
         if self.outside is None:
             return NoMedia()
-        return media_of(scene, False, Distances(), self.query.has_chromatic_media)
+        chromatic = self.query.has_chromatic_media
+        return media_of(scene, False, Distances(), chromatic, connects_all=True)
 
     def _launch(self, scene, numbers, emitted: EmittedRay, active) -> tuple[mi.Ray3f, Any]:
         """An emitted ray, which ends where it scatters in a medium, and the state there."""
@@ -338,9 +353,13 @@ class LightWalk:
             return media.goes_on(vertex, self.max_depth, active)[0]
         return active & (vertex.depth < last_depth)
 
-    def _scatter(self, heroes, vertex: Vertex, bs, weight, history, stores, active):
-        """The weight of a BSDF sample, the history behind it, the factor of the sampling weight
-        (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
+    def _carried(self, media: NoMedia, β: mi.Spectrum, vertex: Vertex) -> mi.Spectrum:
+        """The throughput that is stored with ``vertex``."""
+        return β if self.connects else media.arriving(β, vertex)
+
+    def _scatter(self, heroes, vertex: Vertex, bs, weight, active):
+        """The weight of a BSDF sample, the density of the reverse direction, the factor of the
+        sampling weight (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
         bsdf, si, is_alone = vertex.bsdf, vertex.si, vertex.path.hero_is_alone
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         weight, hero_count, hero_is_alone = heroes.scatter(is_alone, weight, bsdf, si, bs)
@@ -348,9 +367,7 @@ class LightWalk:
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         active &= self.program.is_open(si, bs.wo)
-        passes = is_delta | ~stores
-        history = self.program.leave(history, vertex, bs, reverse_pdf, passes)
-        return dr.select(active, weight, 0), history, hero_count, hero_is_alone
+        return dr.select(active, weight, 0), reverse_pdf, hero_count, hero_is_alone
 
     def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Whether vertices with this BSDF are stored."""

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ...transport.path_decisions import SubpathSelection
 from .both_ends import from_both_ends
-from .scattering import geometric_cosine
+from .scattering import SurfaceTerms
 
 
 @dataclass
@@ -89,6 +89,7 @@ class PartialSums:
         light_paths: Number of light paths for each camera path: the number of samples of the
             technique that connects light paths to the sensor (t = 1).
         has_clear_curves: Whether light passes through a curve (``scene/bsdfs.py``).
+        terms: The terms of vertices.
     """
 
     def __init__(
@@ -101,7 +102,9 @@ class PartialSums:
         merges_all: bool = False,
         light_paths: mi.Float | float = 1.0,
         has_clear_curves: bool = False,
+        terms: SurfaceTerms = SurfaceTerms(),  # noqa: B008  (never modified)
     ) -> None:
+        self.terms = terms
         self.exponent, self.splits, self.selection = exponent, splits, selection
         #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
@@ -115,7 +118,7 @@ class PartialSums:
     def cosine(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
         """The geometric cosine of a local direction; 0 for directions into a curve, from which no
         light path comes and to which none goes."""
-        return dr.select(self.is_open(si, d), geometric_cosine(si, d), 0)
+        return dr.select(self.is_open(si, d), self.terms.cosine(si, d), 0)
 
     def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
         """Whether a local direction does not lead into a curve. The inside of curves is left to
@@ -225,10 +228,13 @@ class PartialSums:
         densities per area.
 
         Parameters:
+            squared_distance: In participating media, divided by the known transmittance, since the
+                segment is passed with this probability. (It is no part of dVC, where the same
+                factor occurs in the densities from both sides.)
             is_first: Whether ``si`` is the first vertex of the subpath.
             by_light: Whether the subpath is a light path.
         """
-        inverse = dr.rcp(dr.maximum(arrival_cosine(si), 1e-12))
+        inverse = dr.rcp(dr.maximum(self.terms.cosine(si, si.wi), 1e-12))
         region, count = None, None
         if self.selection is not None:
             region = self.selection.region(from_both_ends(si), si.is_valid())
@@ -331,8 +337,3 @@ class PartialSums:
 def weight(others: mi.Float) -> mi.Float:
     """The MIS weight of a technique, from the sum of the other techniques' density ratios to it."""
     return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
-
-
-def arrival_cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
-    """The cosine between the direction of arrival and the geometric normal."""
-    return dr.abs(dr.dot(si.n, si.to_world(si.wi)))

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...scene.media import may_have_grids
 from ...scene.movers import movers
 from ...transport.estimator import CameraRays, Sample
 from ...transport.frozen import frozen
@@ -26,10 +27,13 @@ from .emission import LightEmission
 from .light_image import LightImage
 from .light_numbers import LightPathRays
 from .light_walk import LightWalk
+from .medium_programs import BidirectionalProgramInMedia, LightSumsInMedia
+from .medium_scattering import MediumTerms
 from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths
 from .merging.merging_radius import MergingRadius
 from .merging.vertex_grid import VertexGrid
 from .partial_sums import PartialSums
+from .scattering import SurfaceTerms
 from .sensor import ConnectableSensor
 from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
 
@@ -66,6 +70,7 @@ class BidirectionalPathTracer:
             different lanes cannot be connected (see ``selection`` and ``is_alone``).
         most_lanes: The largest number of lanes for which the memory of stored vertices suffices; 0
             for any number.
+        outside: See :class:`LightWalk`.
     """
 
     walk: Walk
@@ -80,6 +85,7 @@ class BidirectionalPathTracer:
     merges_all: bool = False
     light_paths: float = 1.0
     most_lanes: int = 0
+    outside: mi.MediumPtr | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -108,10 +114,13 @@ class BidirectionalPathTracer:
             paths = min(lanes, self.radius.pixels) if own_lane else light.count
             radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
+        # Light paths scatter in media
+        in_media = self.outside is not None
+        terms = MediumTerms(may_have_grids(scene)) if in_media else SurfaceTerms()
         sums = PartialSums(
             dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,
             merges_all=self.merges_all, light_paths=dr.opaque(mi.Float, per_camera_path),
-            has_clear_curves=self.emission.has_clear_curves,
+            has_clear_curves=self.emission.has_clear_curves, terms=terms,
         )  # fmt: skip
         image = None
         if self.sensor is not None:
@@ -119,10 +128,14 @@ class BidirectionalPathTracer:
             image = LightImage(
                 scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
                 2 if self.skips_direct else 1, observer, per_camera_path, walk.channels,
+                terms,
             )  # fmt: skip
+        light_program = LightSums(sums, walk.next_event)
+        if in_media:
+            light_program = LightSumsInMedia(sums, walk.next_event, scene)
         light_walk = LightWalk(
-            self.emission, walk.max_depth, walk.rr_depth, LightSums(sums, walk.next_event),
-            query=walk.query, channels=walk.channels,
+            self.emission, walk.max_depth, walk.rr_depth, light_program, query=walk.query,
+            outside=self.outside, connects=True, channels=walk.channels,
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
@@ -149,7 +162,8 @@ class BidirectionalPathTracer:
                     vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
                     observer, walk.channels,
                 )  # fmt: skip
-        program: PathProgram = BidirectionalProgram(
+        kind = BidirectionalProgramInMedia if in_media else BidirectionalProgram
+        program: PathProgram = kind(
             scene, sums, self.emission, self.sensor, observer, subpaths
         )
         if self.skips_direct:

@@ -1,5 +1,5 @@
 """BSDFs at vertices of light paths, evaluated so that light paths and ``path`` have the same
-integrand.
+integrand. :class:`SurfaceTerms` bundles what bidirectional methods need of a vertex.
 
 ``path`` evaluates BSDFs with ``wi`` towards the camera. Some are not reciprocal (normal and bump
 maps, hair, thin transmission), so light paths evaluate them in the same way, although they travel
@@ -50,6 +50,49 @@ def adjoint_value(
     arrives, leaves = geometric_cosine(si, si.wi), geometric_cosine(si, to_camera)
     # The value holds the shading cosine of arrival
     return value * dr.select(arrives > 0, leaves / arrives, 0), pdf
+
+
+class SurfaceTerms:
+    """What a vertex of a camera path or a light path contributes to the throughput and the
+    densities of a complete path. This class is for vertices on surfaces. Methods receive the
+    interaction ``si``, the ``bsdf``, and the participating medium in which the vertex lies
+    (``None`` here).
+
+    Attributes:
+        sees_media: Whether vertices may lie in media.
+    """
+
+    sees_media = False
+
+    def eval(
+        self, ctx: mi.BSDFContext, bsdf, si, medium, wo: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """The value for light from ``wo`` (local), cosine included, and the density with which
+        scattering samples ``wo``."""
+        return eval_bsdf(bsdf, ctx, si, wo, active)
+
+    def adjoint(
+        self, ctx: mi.BSDFContext, bsdf, si, medium, to_camera: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """At a vertex of a light path: :func:`adjoint_value`."""
+        return adjoint_value(ctx, bsdf, si, to_camera, active)
+
+    def density(
+        self, ctx: mi.BSDFContext, bsdf, si, medium, wo: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float:
+        """The second result of :meth:`eval`."""
+        return bsdf_density(bsdf, ctx, si, wo, active)
+
+    def reverse_density(
+        self, ctx: mi.BSDFContext, bsdf, si, medium, wo: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float:
+        """The density with which a path that arrives from ``wo`` goes on towards ``si.wi``."""
+        return reverse_density(ctx, bsdf, si, wo, active)
+
+    def cosine(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
+        """The factor that turns densities per solid angle, for paths from the local direction
+        ``d``, into densities of the vertex: the geometric cosine."""
+        return geometric_cosine(si, d)
 
 
 def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:

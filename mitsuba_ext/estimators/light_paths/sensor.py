@@ -37,6 +37,12 @@ class SensorConnection:
     importance: mi.Float
     active: mi.Bool
 
+    def direction_sample(self) -> mi.DirectionSample3f:
+        """What a shadow ray needs."""
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(self.dist))
+        ds.p, ds.d, ds.dist = self.target, self.d, self.dist
+        return ds
+
 
 class UniformLens:
     """Chooses points of the aperture uniformly."""
@@ -149,8 +155,7 @@ def is_occluded(
 ) -> mi.Bool:
     """Whether the connection of ``si`` to the sensor is occluded. With ``hides_emitters``, area
     lights do not occlude."""
-    ds = dr.zeros(mi.DirectionSample3f, dr.width(si))
-    ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
+    ds = connection.direction_sample()
     if not hides_emitters:
         return query.occluded(scene, si, ds, active)
     return _is_occluded_by_others(query, scene, query.shadow_ray(scene, si, ds), ds.p, active)

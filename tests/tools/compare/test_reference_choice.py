@@ -67,7 +67,7 @@ def test_the_reference_comes_from_an_integrator_that_sees_the_whole_scene(scene,
 
 def test_light_that_the_reference_lacks_is_named():
     fog = compare.load_scene({**fogs.fog("point"), "ball": _GLASS}, keep_integrator=False)
-    assert "lacks light" in choose_integrator(fog).remarks[1]
+    assert choose_integrator(fog).integrator == "bdpt"
     fisheye = {"type": "orthographic", "film": film(8, 8)}
     scene = {**_scene(lamp=_BEAM), "sensor": fisheye}
     chosen = choose_integrator(compare.load_scene(scene, keep_integrator=False))

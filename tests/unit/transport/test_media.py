@@ -12,7 +12,17 @@ from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.free_flight import Distances
 from mitsuba_ext.transport.path_decisions import DirectionSamples
 from mitsuba_ext.transport.walk import Walk
-from tests.support.fogs import LIGHTS, camera, cube, fog, fog_around_the_camera, grid, homogeneous
+from tests.support.fogs import (
+    LIGHTS,
+    camera,
+    cube,
+    empty_cloud,
+    fog,
+    fog_around_the_camera,
+    grid,
+    homogeneous,
+    leaves_and_windows,
+)
 from tests.support.stage import area, diffuse, film, lookat, sensor
 from tests.support.statistical import (
     REFERENCE_SEEDS,
@@ -207,28 +217,10 @@ def _glass_of_milk() -> dict:
     }}  # fmt: skip
 
 
-def _leaves_and_windows() -> dict:
-    """What lets rays pass without turning them: half transparent and thin glass."""
-    T = mi.ScalarTransform4f
-    leaf = {"type": "mask", "opacity": 0.4, "bsdf": diffuse(0.6)}
-    window = {"type": "rectangle", "to_world": T().translate([0, 0, 1.6]).scale(1.5),
-              "bsdf": {"type": "thindielectric"}}  # fmt: skip
-    return fog("area", fog=cube(homogeneous(), bsdf=leaf), window=window)
-
-
-def _empty_cloud() -> dict:
-    """A grid with holes: the density is zero there."""
-    density = np.zeros((4, 4, 4, 1), dtype=np.float32)
-    density[::2, 1:3, ::2] = 6.0
-    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density),
-              "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}  # fmt: skip
-    return fog("point", {"type": "heterogeneous", "sigma_t": volume, "albedo": 0.9})
-
-
 SPECIAL = {
     "glass_of_milk": _glass_of_milk,
-    "leaves_and_windows": _leaves_and_windows,
-    "empty_cloud": _empty_cloud,
+    "leaves_and_windows": leaves_and_windows,
+    "empty_cloud": empty_cloud,
     "around_the_camera": lambda: fog_around_the_camera("area"),
     "grid_around_the_camera": lambda: fog_around_the_camera("point", grid(0.4)),
 }
@@ -242,7 +234,7 @@ def test_special_media_have_the_mean_of_volpath(name: str) -> None:
 @pytest.mark.parametrize("max_depth", [1, 2])
 def test_paths_through_leaves_end_at_their_longest_length(max_depth: int) -> None:
     """What passes the last vertex adds none; what it scatters would."""
-    scene = mi.load_dict({**_leaves_and_windows(), "light": LIGHTS["environment"]})
+    scene = mi.load_dict({**leaves_and_windows(), "light": LIGHTS["environment"]})
     _compare(scene, _make(max_depth), _volpath(max_depth), 512)
 
 
@@ -339,7 +331,7 @@ def test_maps_of_distances_leave_the_radiance_of_a_white_world() -> None:
 
 
 @pytest.mark.parametrize("parameters", [
-    {"type": "bdpt"}, {"type": "light_tracer"}, {"type": "pssmlt"}, {"type": "mlt"},
+    {"type": "bdpt", "subpath_selection": "visibility"}, {"type": "pssmlt"}, {"type": "mlt"},
     {"type": "erpt"}, {"type": "erpt", "mutations": "path"}, {"type": "two_stage"},
     {"type": "composed_path", "next_event": "linear"},
     {"type": "composed_path", "next_event": "resampled"},

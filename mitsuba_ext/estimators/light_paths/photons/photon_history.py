@@ -74,7 +74,8 @@ class RegionProgram(LightProgram):
     def first(self, scene, query, emitted, pi, active) -> RegionHistory:
         return RegionHistory(dr.zeros(mi.UInt32, dr.width(emitted.ray)))
 
-    def arrive(self, history, si, depth) -> RegionHistory:
+    def arrive(self, history, vertex, start) -> RegionHistory:
+        si = vertex.si
         return RegionHistory(self._selection.region(from_both_ends(si), si.is_valid()))
 
 

@@ -28,7 +28,7 @@ class LearnedSubpaths(Technique):
 
     name = "visibility"
     slots, words = ("subpath_selection",), {"visibility": {}}
-    pilot_spp, tries = 16, True
+    pilot_spp, tries, sees_media = 16, True, False
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         is_shared = not mi.is_spectral and not movers(scene)

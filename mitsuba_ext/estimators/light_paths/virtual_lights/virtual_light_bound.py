@@ -122,7 +122,7 @@ class CompensatingPaths(EndingProgram):
         region = None if self._selection is None else mi.UInt32(0)
         return Link(mi.Float(1), mi.Float(dr.inf), mi.Float(dr.inf), mi.Bool(False), region)
 
-    def arrive(self, path, si):
+    def arrive(self, path, si, in_medium):
         link, arrival = path.history, path.arrival
         d = si.p - arrival.ref.p
         squared = dr.squared_norm(d)

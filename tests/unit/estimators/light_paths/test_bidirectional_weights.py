@@ -20,11 +20,13 @@ from mitsuba_ext.scene.regions.nested_regions import NestedRegions
 from mitsuba_ext.scene.regions.surface_voxels import SurfaceRows
 from mitsuba_ext.transport.light_table import LightTable, sampling_weights
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
+from tests.support import fogs
 from tests.support.bidirectional_paths import (
     CONNECTIONS,
     LIGHT_PATHS,
     Paths,
     trace,
+    trace_in_medium,
     weights_of_techniques,
 )
 from tests.support.emitters_and_materials import EMITTERS, MATERIALS, SPECULAR, T, stage_with_ball
@@ -175,6 +177,22 @@ def test_weights_of_light_vertices_that_are_chosen_by_regions_add_up(bsdf: str) 
     selection = any_table(*(weights(scene, *shape)[2] for shape in ((2, 1), (1, 2))))
     for light, camera in ((1, 1), (2, 1), (1, 2)):
         assert_they_add_up(weights(scene, light, camera, selection=selection)[0])
+
+
+@pytest.mark.parametrize("light", some("area", "environment", of=fogs.LIGHTS))
+def test_weights_of_paths_in_a_medium_add_up(light: str) -> None:
+    """For any transmittances of the segments."""
+    scene = mi.load_dict({
+        "type": "scene", "light": fogs.LIGHTS[light],
+        "sensor": fogs.camera(medium=fogs.homogeneous(g=0.5)),
+    })  # fmt: skip
+    emission, eye = LightEmission(scene), scene.sensors()[0]
+    for count in (1, 2, 3):
+        paths = trace_in_medium(scene, emission, eye, count)
+        found, exists, _ = weights_of_techniques(
+            scene, paths, emission, ConnectableSensor(eye), EmitterSampling()
+        )
+        assert_they_add_up(found[:, exists])
 
 
 # ---- Densities with which camera paths find what light paths find ----

@@ -12,7 +12,15 @@ import pytest
 from mitsuba_ext.estimators.light_paths.light_media import outer_medium
 from mitsuba_ext.estimators.light_paths.merging.merging_radius import MergingRadius
 from mitsuba_ext.transport.path_decisions import SceneQuery
-from tests.support.fogs import camera, cube, fog, fog_around_the_camera, grid, homogeneous
+from tests.support.fogs import (
+    SCENES,
+    camera,
+    cube,
+    fog,
+    fog_around_the_camera,
+    homogeneous,
+    without_boundary,
+)
 from tests.support.stage import area, diffuse, lookat, sensor
 from tests.support.statistical import assert_images_are_sound, assert_same_quarters, batches, some
 
@@ -26,6 +34,7 @@ def make(name: str = "sppm", max_depth: int = 6, **parameters: Any) -> mi.Integr
     return mi.load_dict({"type": name, "max_depth": max_depth, **parameters})
 
 
+<<<<<<< HEAD
 def _glass_in_fog() -> dict:
     ball = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"},
             "exterior": {"type": "ref", "id": "around"}}  # fmt: skip
@@ -65,6 +74,8 @@ SCENES = {
 }
 
 
+=======
+>>>>>>> a349c36e (Light paths in participating media: light_tracer and bdpt)
 @pytest.mark.parametrize("name", some("chromatic", of=SCENES))
 def test_fog_has_the_mean_of_volpath(name: str) -> None:
     scene = mi.load_dict(SCENES[name](), optimize=False)
@@ -142,13 +153,13 @@ def test_the_medium_outside_is_that_behind_the_last_boundary() -> None:
         medium = outer_medium(SceneQuery(), loaded, loaded.sensors()[0])
         return bool(dr.all(medium != None))  # noqa: E711
 
-    assert outside(_without_boundary())
+    assert outside(without_boundary())
     assert not outside(fog()) and not outside(fog_around_the_camera())
     hole = {"type": "sphere", "radius": 3.0, "bsdf": {"type": "null"}, "exterior": homogeneous()}
-    assert outside({**_without_boundary(), "hole": hole})
+    assert outside({**without_boundary(), "hole": hole})
 
 
-@pytest.mark.parametrize("name", ["vcm", "bdpt", "photon_map"])
+@pytest.mark.parametrize("name", ["vcm", "instant_radiosity", "photon_map"])
 def test_others_with_light_paths_refuse_media_and_name_sppm(name: str) -> None:
     with pytest.raises(NotImplementedError, match='do not scatter in a medium.*"sppm"'):
         make(name).render(mi.load_dict(fog()), spp=1)
