@@ -130,6 +130,13 @@ def without_boundary() -> Scene:
     return {**scene, "sensor": {**scene["sensor"], "medium": homogeneous(0.1)}}
 
 
+def skin() -> Scene:
+    """A ball of a dense medium with a rough boundary."""
+    ball = {"type": "sphere", "interior": homogeneous([2.0, 3.0, 5.0], [0.95, 0.9, 0.8], 0.0),
+            "bsdf": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4}}  # fmt: skip
+    return fog("area", fog=ball)
+
+
 SCENES = {
     "lamp_outside": lambda: fog("area"),
     "lamp_inside": lambda: fog("area_inside"),
@@ -146,6 +153,7 @@ SCENES = {
     "nested": lambda: fog("area", inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
     "without_emitter_sampling": lambda: fog("area", homogeneous(sample_emitters=False)),
     "glass_in_fog": glass_in_fog,
+    "skin": skin,
 }
 
 #: More of them, with what makes media hard.

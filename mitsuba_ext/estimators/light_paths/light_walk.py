@@ -280,11 +280,10 @@ class LightWalk:
             active_next = self._goes_on(media, vertex, last_depth, active)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
             bs, weight = directions.sample(bsdf, ctx, si, sample_1, sample_2, active_next)
-            weight, reverse_pdf, hero_count, hero_is_alone = self._scatter(
-                heroes, vertex, bs, weight, active_next
+            weight, reverse_pdf, passes, hero_count, hero_is_alone = self._scatter(
+                heroes, vertex, bs, weight, stores, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
-            passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | ~stores
             history = self.program.leave(history, vertex, bs, reverse_pdf, passes)
             events = self.channels and self.channels.left_by_light(vertex, bs, active_next)
             β = β * weight
@@ -357,9 +356,10 @@ class LightWalk:
         """The throughput that is stored with ``vertex``."""
         return β if self.connects else media.arriving(β, vertex)
 
-    def _scatter(self, heroes, vertex: Vertex, bs, weight, active):
-        """The weight of a BSDF sample, the density of the reverse direction, the factor of the
-        sampling weight (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
+    def _scatter(self, heroes, vertex: Vertex, bs, weight, stores, active):
+        """The weight of a BSDF sample, the density of the reverse direction, ``passes`` of
+        :meth:`LightProgram.leave`, the factor of the sampling weight (:meth:`Heroes.scatter`), and
+        whether only the hero wavelength is left."""
         bsdf, si, is_alone = vertex.bsdf, vertex.si, vertex.path.hero_is_alone
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         weight, hero_count, hero_is_alone = heroes.scatter(is_alone, weight, bsdf, si, bs)
@@ -367,7 +367,8 @@ class LightWalk:
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         active &= self.program.is_open(si, bs.wo)
-        return dr.select(active, weight, 0), reverse_pdf, hero_count, hero_is_alone
+        passes = is_delta | ~stores
+        return dr.select(active, weight, 0), reverse_pdf, passes, hero_count, hero_is_alone
 
     def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Whether vertices with this BSDF are stored."""

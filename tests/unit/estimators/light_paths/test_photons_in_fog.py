@@ -19,6 +19,7 @@ from tests.support.fogs import (
     fog,
     fog_around_the_camera,
     homogeneous,
+    skin,
     without_boundary,
 )
 from tests.support.stage import area, diffuse, lookat, sensor
@@ -34,48 +35,6 @@ def make(name: str = "sppm", max_depth: int = 6, **parameters: Any) -> mi.Integr
     return mi.load_dict({"type": name, "max_depth": max_depth, **parameters})
 
 
-<<<<<<< HEAD
-def _glass_in_fog() -> dict:
-    ball = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"},
-            "exterior": {"type": "ref", "id": "around"}}  # fmt: skip
-    return {**fog_around_the_camera("area", homogeneous(0.2)), "ball": ball}
-
-
-def _without_boundary() -> dict:
-    """Fog everywhere: only the sensor knows of it."""
-    scene = {k: v for k, v in fog("area_inside").items() if k != "fog"}
-    return {**scene, "sensor": {**scene["sensor"], "medium": homogeneous(0.1)}}
-
-
-def _skin() -> dict:
-    """A ball of a dense medium with a rough boundary."""
-    ball = {"type": "sphere", "interior": homogeneous([2.0, 3.0, 5.0], [0.95, 0.9, 0.8], 0.0),
-            "bsdf": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4}}  # fmt: skip
-    return fog("area", fog=ball)
-
-
-SCENES = {
-    "lamp_outside": lambda: fog("area"),
-    "lamp_inside": lambda: fog("area_inside"),
-    "point_inside": lambda: fog("point_inside"),
-    "sky": lambda: fog("environment"),
-    "sun": lambda: fog("directional"),
-    "chromatic": lambda: fog("area", homogeneous([0.2, 0.5, 0.9], [0.9, 0.6, 0.3])),
-    "forward": lambda: fog("area", homogeneous(g=0.8)),
-    "backward": lambda: fog("area", homogeneous(g=-0.6)),
-    "thick": lambda: fog("area", homogeneous(8.0, 0.95)),
-    "grid": lambda: fog("area", grid()),
-    "around_the_camera": lambda: fog_around_the_camera("area_inside", homogeneous(0.2)),
-    "without_boundary": _without_boundary,
-    "nested": lambda: fog("area", inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
-    "without_emitter_sampling": lambda: fog("area", homogeneous(sample_emitters=False)),
-    "glass_in_fog": _glass_in_fog,
-    "skin": _skin,
-}
-
-
-=======
->>>>>>> a349c36e (Light paths in participating media: light_tracer and bdpt)
 @pytest.mark.parametrize("name", some("chromatic", of=SCENES))
 def test_fog_has_the_mean_of_volpath(name: str) -> None:
     scene = mi.load_dict(SCENES[name](), optimize=False)
@@ -87,7 +46,7 @@ def test_fog_has_the_mean_of_volpath(name: str) -> None:
 def test_light_inside_a_rough_boundary_is_gathered_there() -> None:
     """A camera path that merged photons at the boundary would find few through its narrow lobe:
     220 times the variance."""
-    scene = mi.load_dict(_skin(), optimize=False)
+    scene = mi.load_dict(skin(), optimize=False)
     images = batches(scene, make(**_RADII), 256, range(1, 5))[:, 5:11, 5:11]
     assert_images_are_sound(images)
     variance = 256 * images.var(axis=0, ddof=1).mean()
