@@ -47,11 +47,11 @@ class LearnedLightsPlugin(DecisionPlugin):
     tree stays, and learning ends. Otherwise each further pilot chooses its lights by what the
     earlier pilots have learned. All samples have the same weight, and no stage uses what it learns
     from its own samples, so the image is unbiased. A tenth of the choices do not depend on what was
-    learned. The second and third pilots measure how much lower the variance of the image is than with the choice
-    of :monosp:`path`. If the reduction is less than about 15 %, the table is not worth the time of
-    its look-ups, and learning ends, unless :monosp:`grid` or also a :monosp:`visibility_roulette`
-    is given. The integrator saves the map with everything else that it has learned
-    (:monosp:`save_learned`).
+    learned. The second and third pilots measure how much lower the variance of the image is than
+    with the choice of :monosp:`path`. If the reduction is less than about 15 %, the table is not
+    worth the time of its look-ups, and learning ends, unless :monosp:`grid` or also a
+    :monosp:`visibility_roulette` is given. The integrator saves the map with everything else that
+    it has learned (:monosp:`save_learned`).
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
     :monosp:`path` is biased for these lights, because of a fault in Mitsuba. Nested in
