@@ -269,16 +269,22 @@ class PathChannels:
         return self._of_surface(shape, mi.UInt32(_SPECULAR), transmits)
 
     def at_end(
-        self, vertex: Vertex, wo: mi.Vector3f, chain: Sequence[tuple[mi.UInt32, mi.Bool]],
-        emitter: mi.EmitterPtr, active: mi.Bool,
+        self,
+        vertex: Vertex,
+        wo: mi.Vector3f,
+        bsdf_value: mi.Spectrum,
+        chain: Sequence[tuple[mi.UInt32, mi.Bool]],
+        emitter: mi.EmitterPtr,
+        active: mi.Bool,
     ) -> list[mi.UInt32]:
-        """The cells of a path that leaves ``vertex`` in the direction ``wo``, and is bent by smooth
-        surfaces until it ends in ``emitter``: see :meth:`add`.
+        """The cells of a path that leaves ``vertex`` in the direction ``wo``, where the BSDF has
+        the value ``bsdf_value``, and is bent by smooth surfaces until it ends in ``emitter``: see
+        :meth:`add`.
 
         Args:
             chain: The symbol of each surface, and whether there is one.
         """
-        kinds = self._chosen(vertex, wo, None, active)
+        kinds = self._chosen(vertex, wo, bsdf_value, active)
         states = self._behind(vertex, [self._symbol(vertex, wo, kind) for kind in kinds])
         for symbol, exists in chain if self._reads else ():
             states = [

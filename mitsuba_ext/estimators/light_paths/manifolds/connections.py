@@ -186,7 +186,7 @@ class ManifoldConnections:
         if channels is not None:
             at = Vertex(si, si.bsdf(), PathState(*[None] * 6, events=chosen.events))
             wo = si.to_local(found.d)
-            cells = channels.at_end(at, wo, end.symbols(), light.emitter, visible)
+            cells = channels.at_end(at, wo, value, end.symbols(), light.emitter, visible)
         shadow_count = dr.select(tested, mi.UInt32(1), 0)
         return ChainLight(dr.select(visible, L, 0), shadow_count, end.first, cells)
 
