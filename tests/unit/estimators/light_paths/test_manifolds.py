@@ -394,7 +394,7 @@ def test_light_of_connections_is_in_the_channels_of_its_events() -> None:
     image = _render(scene, 16, max_depth=4)
     found = _render(scene, 16, max_depth=4, aovs=aovs)
     diffuse, glossy, through, mirrored = (found[..., i : i + 3] for i in range(3, 15, 3))
-    np.testing.assert_array_equal(found[..., :3], image)
+    np.testing.assert_allclose(found[..., :3], image, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(diffuse + glossy, image, rtol=1e-4, atol=1e-5)
     for part in (diffuse, glossy, through, mirrored):
         assert part.mean() > 1e-5
@@ -425,7 +425,7 @@ def test_timed_renders_begin_with_connections() -> None:
 def test_passes_are_recorded(monkeypatch) -> None:
     """Python traces the walk and the search for the first render, once for the pilots and once for
     the last stage."""
-    gc.collect()  # Dr.Jit records anew where objects of other scenes have gone since
+    gc.collect()  # Dr.Jit records anew, and may round differently, where other scenes have gone
     traced = []
     trace = ManifoldTracer.trace
     monkeypatch.setattr(ManifoldTracer, "trace", lambda *a: traced.append(1) or trace(*a))
@@ -436,6 +436,7 @@ def test_passes_are_recorded(monkeypatch) -> None:
 
 
 def test_the_same_seed_gives_the_same_image() -> None:
+    gc.collect()  # as above
     scene = _scene(**_statistical()["ball"])
     first = _render(scene, 16, seed=3)
     np.testing.assert_array_equal(first, _render(scene, 16, seed=3))
