@@ -28,8 +28,8 @@ _LEAST_SHARE = 1 / 64
 #: Two trials have found the same chain if their first directions differ by less than this angle:
 #: more than rounding, less than the distance of different chains.
 _SAME = 3e-4
-#: The number of lanes is smaller than the number of paths by this factor: see :class:`Queue`.
-_PATHS_PER_LANE = 16
+#: How many paths a lane takes: see :class:`Queue`.
+_PATHS_PER_LANE = 32
 #: Trials end here. In pool, one chain in 10^6 needs more.
 _MOST_TRIALS = 1 << 16
 
@@ -173,31 +173,42 @@ class Found:
 
 # Not a dataclass: loops only read it
 class Queue:
-    """The paths for which there is something to do. Lanes take them one after the other.
+    """The paths for which there is something to do. Lanes take several, one after the other.
 
     Dr.Jit works on 8 to 32 lanes at once, and all wait for the slowest, which may need thousands of
-    trials: so a lane that is done takes the next path."""
+    trials: the sums of several paths differ less. Which lane takes which path does not depend on
+    the time that others take: rounding in Embree depends on the rays that are traced together, and
+    the same seed would not give the same image."""
 
     def __init__(self, active: mi.Bool) -> None:
-        count = dr.width(active)
-        self._size, self._taken = (dr.zeros(mi.UInt32, 1) for _ in range(2))
-        self._paths = dr.empty(mi.UInt32, count)
-        place = dr.scatter_inc(self._size, mi.UInt32(0), active)
-        dr.scatter(self._paths, dr.arange(mi.UInt32, count), place, active)
-        dr.eval(self._size, self._paths, self._taken)
+        self._count = dr.width(active)
+        each = dr.select(active, mi.UInt32(1), 0)
+        place = dr.prefix_sum(each)
+        self._paths = dr.empty(mi.UInt32, self._count)
+        dr.scatter(self._paths, dr.arange(mi.UInt32, self._count), place, active)
+        self._size = dr.gather(mi.UInt32, place + each, dr.opaque(mi.UInt32, self._count - 1))
+        self._stride = (self._size + (_PATHS_PER_LANE - 1)) // _PATHS_PER_LANE
+        dr.eval(self._size, self._stride, self._paths)
 
-    def next(self, path: mi.UInt32, idle: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        """The next path for idle lanes, ``path`` for others, and whether there is one."""
-        following, exists = self._at(dr.scatter_inc(self._taken, mi.UInt32(0), idle), idle)
-        return dr.select(idle, following, path), ~idle | exists
+    def first(self) -> tuple[mi.UInt32, mi.Bool]:
+        """The place of the first path of each lane, and whether there is one."""
+        lane = dr.arange(mi.UInt32, -(-self._count // _PATHS_PER_LANE))
+        return lane, lane < self._stride
+
+    def next(self, place: mi.UInt32, ends: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The place of the next path where one ``ends``, and whether there is one."""
+        place = place + dr.select(ends, self._stride, 0)
+        return place, place < self._size
+
+    def path(self, place: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The path at a place."""
+        return dr.gather(mi.UInt32, self._paths, place, active)
 
     def all(self) -> tuple[mi.UInt32, mi.Bool]:
         """The paths, in the first lanes of a kernel with as many lanes as there are paths."""
-        return self._at(dr.arange(mi.UInt32, dr.width(self._paths)), mi.Bool(True))
-
-    def _at(self, place: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        exists = active & (place < dr.gather(mi.UInt32, self._size, mi.UInt32(0)))
-        return dr.gather(mi.UInt32, self._paths, place, exists), exists
+        lane = dr.arange(mi.UInt32, self._count)
+        exists = lane < self._size
+        return self.path(lane, exists), exists
 
 
 @dataclass
@@ -240,17 +251,17 @@ class Solver:
         found_d = dr.zeros(mi.Float, 3 * tasks.count)
         found_pattern = dr.zeros(mi.UInt32, tasks.count)
         count = dr.opaque(mi.UInt32, tasks.count)
-        idle = dr.full(mi.Bool, True, _lanes(tasks.count))
-        path, going, walk = mi.UInt32(0), mi.Bool(True), _new_walk()
+        place, going = queue.first()
+        walk = _new_walk()
         while dr.hint(going, label="first trial"):
-            path, going = queue.next(path, idle)
+            path = queue.path(place, going)
             search = tasks.at(path, going)
             solved, ends, pattern, d = self._advance(walk, search, mi.UInt32(0), going)
             for i in range(3):
                 dr.scatter(found_d, d[i], path + i * count, solved)
             dr.scatter(found_pattern, pattern, path, solved)
             walk.steps = dr.select(ends, 0, walk.steps)
-            idle = ends
+            place, going = queue.next(place, ends)
         index = dr.arange(mi.UInt32, tasks.count)
         d = mi.Vector3f(*(dr.gather(mi.Float, found_d, index + i * count) for i in range(3)))
         return Found(d, found_pattern >> 2, found_pattern & 3)
@@ -260,10 +271,10 @@ class Solver:
         """How many further trials it takes to find a chain again, for each path of ``queue``. The
         mean of this number is 1 / the probability of finding it."""
         result = dr.zeros(mi.UInt32, tasks.count)
-        idle = dr.full(mi.Bool, True, _lanes(tasks.count))
-        path, going, walk, trial = mi.UInt32(0), mi.Bool(True), _new_walk(), mi.UInt32(1)
+        place, going = queue.first()
+        walk, trial = _new_walk(), mi.UInt32(1)
         while dr.hint(going, label="further trials"):
-            path, going = queue.next(path, idle)
+            path = queue.path(place, going)
             search = tasks.at(path, going)
             solved, ends, pattern, d = self._advance(walk, search, trial, going)
             length, transmits = (
@@ -276,7 +287,7 @@ class Solver:
             finishes = is_same | (ends & (trial >= _MOST_TRIALS))
             walk.steps = dr.select(ends, 0, walk.steps)
             trial = dr.select(finishes, 1, trial + dr.select(ends, mi.UInt32(1), 0))
-            idle = finishes
+            place, going = queue.next(place, finishes)
         return result
 
     def _advance(
@@ -313,11 +324,6 @@ class Solver:
         fails |= ~dr.isfinite(walk.error)
         pattern = (end.length << 2) | (walk.transmits & ((1 << end.length) - 1))
         return solved, active & (solved | fails), pattern, _turned(d, walk.step, mi.Float(1))
-
-
-def _lanes(paths: int) -> int:
-    """The number of lanes that take ``paths`` paths."""
-    return -(-paths // _PATHS_PER_LANE)
 
 
 def _new_walk() -> NewtonWalk:
