@@ -32,8 +32,8 @@ def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp
 
 def mean_weights(film: mi.Film) -> np.ndarray:
     """The mean of the filter weights that one camera sample in each pixel adds to each pixel:
-    [height, width]. Pixels at the edges get less, because there are no samples outside of the
-    film."""
+    [height, width]. Pixels at the edges get less where no samples are taken outside of the film
+    (``sample_border``)."""
     rows, columns = _mean_weights(film)
     return rows[:, None] * columns
 

@@ -40,11 +40,14 @@ def film_of(rfilter: str, **parameters: Any) -> mi.Film:
 
 def fill(images: PassImages, film: mi.Film, passes: int) -> None:
     """Adds camera samples of mean 1/2 and variance 1/12, and splats of mean 1 and variance 1 (one
-    in two samples has a splat of 2 somewhere on the film)."""
+    in two samples has a splat of 2 somewhere on the film), also beyond the edges of a film that
+    samples its border."""
     film.prepare([])
     block, splats = film.create_block(), film.create_block()
     rng = np.random.default_rng(1)
-    y, x = np.mgrid[:_SIZE, :_SIZE].reshape(2, -1).repeat(_SPP, axis=1)
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    extent = _SIZE + 2 * border
+    y, x = np.mgrid[:extent, :extent].reshape(2, -1).repeat(_SPP, axis=1) - border
     alpha = block.channel_count() - 4
     images.begin(block, splats, 0)
     for number in range(1, passes + 1):
@@ -52,7 +55,7 @@ def fill(images: PassImages, film: mi.Film, passes: int) -> None:
         position = mi.Point2f(x + rng.random(x.size), y + rng.random(x.size))
         block.put(position, [value, value, value, *[mi.Float(1)] * alpha, mi.Float(1)])
         value = mi.Float(2.0 * (rng.random(x.size) < 0.5))
-        position = mi.Point2f(*(_SIZE * rng.random((2, x.size))))
+        position = mi.Point2f(*(extent * rng.random((2, x.size)) - border))
         splats.put(position, [value, value, value, *[mi.Float(0)] * alpha, mi.Float(0)])
         images.add(block, splats, _SPP * number)
 

@@ -261,7 +261,7 @@ def test_the_image_agrees_with_composed_path_and_later_renders_learn_nothing() -
     integrator = make(next_event="contribution", learn_every=3)
     integrator.render(scene, spp=32, seed=4)
     learned, passes = integrator.statistics.learned, integrator.statistics.passes
-    assert learned.startswith("light map: ") and passes > 1
+    assert learned.startswith("lights: ") and passes > 1
     for _ in range(2):
         integrator.render(scene, spp=32, seed=5)
         assert integrator.statistics.passes == 1 and integrator.statistics.learned == learned
