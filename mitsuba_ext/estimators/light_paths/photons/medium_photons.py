@@ -144,10 +144,9 @@ class MergedInMedia(MergedSubpaths):
         sample, number = sampler.next_1d(searches), mi.UInt32(0)
         t = _distance(number, sample, scattered, chosen)
         σ_s = mi.Spectrum(σ_s)
-        weight = σ_s
+        weight = σ_s * path.β * (self._per_vertex / _POINTS)
         if dr.hint(rates is None, mode="scalar"):
             weight *= dr.select(chosen > 0, scattered / chosen, 0)
-        weight *= path.β * (self._per_vertex / _POINTS)
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
         near = [mi.UInt32(0) for _ in range(BATCH)]
