@@ -8,6 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..util.arrays import host_copy
+from .parameter_values import values_of
+
 
 def fingerprint(scene: mi.Scene) -> str:
     """A hash of shapes, materials and lights, without sensors and films."""
@@ -19,13 +22,11 @@ def fingerprint(scene: mi.Scene) -> str:
 def digest(scene_object: mi.Object) -> bytes:
     """A hash of the class and the parameters of a shape, an emitter or a material."""
     state = hashlib.sha256(scene_object.class_name().encode())
-    parameters = mi.traverse(scene_object)
-    for key in sorted(parameters.keys()):
-        value = parameters[key]
+    for key, value in sorted(values_of(mi.traverse(scene_object)), key=lambda pair: pair[0]):
         state.update(key.encode())
         if dr.is_tensor_v(value):
             value = value.array
-        state.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value)
+        state.update(np.ascontiguousarray(host_copy(value)).tobytes() if dr.is_array_v(value)
                      else repr(value).encode())
     return state.digest()
 

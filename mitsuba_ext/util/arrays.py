@@ -52,6 +52,15 @@ def to_host(*columns: Any) -> list[np.ndarray]:
     return [np.ascontiguousarray(row).view(type_) for row, type_ in zip(rows.T, types)]
 
 
+def host_copy(value: Any) -> np.ndarray:
+    """Copies an array of the scene to the host, and leaves the array as it is. NumPy alone would
+    evaluate literals in place: later kernels would load what earlier ones contain as numbers, and
+    the second render of a scene would differ from the first one by rounding."""
+    copy = type(value)(value)
+    dr.make_opaque(copy)
+    return np.array(copy)
+
+
 def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = True) -> None:
     """Adds values to array elements, each of which belongs to one lane.
 
