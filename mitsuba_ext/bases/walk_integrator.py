@@ -289,9 +289,12 @@ class WalkIntegrator(StagedIntegrator):
     def _learned_by(self, sensor: mi.Sensor) -> str:
         """On what, besides the scene, learned states depend."""
         slots = [f"{slot} = {text}" for slot, text in self._described_slots().items()]
+        # What pays depends on the length of paths, and a guide serves a number of their bounces
+        common = self.common_parameters()
+        depths = [f"{key} = {common[key]}" for key in ("max_depth", "rr_depth")]
         # The tables of some decisions have an entry for each pixel
         width, height = film_extent(sensor.film())
-        return ", ".join([*slots, f"film = {width}x{height}"])
+        return ", ".join([*slots, *depths, f"film = {width}x{height}"])
 
     def _loaded(self, request: Request) -> dict[str, StoredArrays]:
         made_by = self._learned_by(request.sensor)

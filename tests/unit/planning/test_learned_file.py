@@ -4,6 +4,7 @@ scene."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -28,7 +29,7 @@ LEARNING = {
 }
 
 
-def _integrator(text: str, **parameters: str) -> mi.Integrator:
+def _integrator(text: str, **parameters: Any) -> mi.Integrator:
     return mi.load_dict({**parse_plugin(text), "max_depth": 6, **parameters})
 
 
@@ -114,6 +115,22 @@ def test_kept_and_loaded_states_draw_the_same_samples(name, tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("nothing_kept")
+def test_what_is_kept_serves_the_same_path_lengths() -> None:
+    """A guide learned with a `max_depth` of 4 guides 3 bounces: too few for longer paths."""
+    scene = _small("rooms")
+    request = Request(scene, scene.sensors()[0])
+
+    def made(**depths: int) -> mi.Integrator:
+        return mi.load_dict({"type": "pss_guided", "keep_learned": True, **depths})
+
+    first = made(max_depth=4)
+    kept_learning.put(scene, first._learned_by(request.sensor), pilot_spp=32, states={})
+    for same, depths in ((True, {"max_depth": 4}), (False, {"max_depth": 8}), (False, {}),
+                         (False, {"max_depth": 4, "rr_depth": 2})):  # fmt: skip
+        assert (made(**depths).plan_learning(request, 64).restore is not None) == same, depths
+
+
+@pytest.mark.usefixtures("nothing_kept")
 def test_a_render_that_restores_nothing_claims_no_light_paths() -> None:
     """`auto` has never tried light paths for a scene in which nothing was kept."""
     scene, make = _small("rooms"), {"type": "auto", "max_depth": 6, "keep_learned": True}
@@ -174,6 +191,9 @@ def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> Non
         _integrator("neepp", load_learned=str(file)).render(_small("open"), spp=16)
     with pytest.raises(ValueError, match="other parameters"):
         _integrator("neepp:grid=4", load_learned=str(file)).render(_small("rooms"), spp=16)
+    with pytest.raises(ValueError, match="max_depth = 6, .* instead of .*max_depth = 8, "):
+        deeper = _integrator("neepp", load_learned=str(file), max_depth=8)
+        deeper.render(_small("rooms"), spp=16)
     with pytest.raises(ValueError, match="film = "):
         _integrator("neepp", load_learned=str(file)).render(_small("rooms"), _larger_film(), spp=16)
     with pytest.raises(FileNotFoundError, match="does not exist"):
