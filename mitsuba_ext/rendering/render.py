@@ -22,6 +22,7 @@ from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import with_recordings
 from ..util.arrays import from_numpy
+from ..util.spectra import load_tables
 from . import camera
 from .device import device_of, look_again
 from .dither import dithered_parts
@@ -70,6 +71,7 @@ def render(integrator: Staged, request: Request, job: type[Job] | None = None) -
             made.fill_film()
         return made, interrupt
 
+    load_tables()
     try:
         made, interrupt = with_recordings(scene, sensor, attempt)
     except GradientsError:

@@ -29,3 +29,11 @@ def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
     if mi.is_spectral:
         return mi.spectrum_to_srgb(L, wavelengths)
     return mi.Color3f(L.x) if mi.is_monochromatic else L
+
+
+def load_tables() -> None:
+    """Makes Mitsuba load the tables of :func:`to_rgb`. Their first use evaluates all that learners
+    have recorded so far: the first render of a process would launch the walk for these records,
+    and again for the film, with other kernels than later renders."""
+    if mi.is_spectral:
+        mi.spectrum_to_srgb(mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(500))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 
 import drjit as dr
 import mitsuba as mi
@@ -352,3 +354,28 @@ def test_an_interrupted_mi_render_says_where_the_image_is() -> None:
         mi.render(scene, integrator=integrator, spp=8)
     assert "the film holds the image of the finished passes" in str(caught.value.__cause__)
     assert scene.sensors()[0].film().develop().numpy().mean() > 0
+
+
+FIRST_KERNELS = """
+import mitsuba_ext, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_spectral")
+mi.set_log_level(mi.LogLevel.Error)
+film = {"type": "hdrfilm", "width": 4, "height": 4}
+scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film},
+                      "sphere": {"type": "sphere"}, "sky": {"type": "constant"}})
+integrator = mi.load_dict({"type": "pss_guided", "max_depth": 3, "pilot_spp": 4})
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+for _ in range(2):
+    integrator.render(scene, spp=16).numpy()
+    kernels = dr.kernel_history([dr.KernelType.JIT])
+    print(*(kernel["hash"] for kernel in kernels if kernel["operation_count"] > 500))
+"""
+
+
+def test_the_first_spectral_render_of_a_process_has_the_kernels_of_the_next():
+    """Mitsuba's colour tables were loaded between the walk and the film, which evaluates what
+    learners record: the first walk was compiled and launched twice."""
+    first, second = subprocess.run(
+        [sys.executable, "-c", FIRST_KERNELS], capture_output=True, text=True, check=True
+    ).stdout.splitlines()[-2:]
+    assert first == second and len(first.split()) > 2
