@@ -20,8 +20,8 @@ _EVEN = 0.25
 class LossSamples:
     """Camera rays for a pass that computes gradients. A pixel gets samples in proportion to the
     derivative of the loss with respect to its value (and a quarter of them evenly), and none where
-    no sample has an effect. Each sample is weighted by the inverse of its pixel's share, so that
-    the expected gradient does not change.
+    no sample has an effect. Each sample is weighted by the inverse of the number of samples that
+    its pixel has, or is expected to have, so that the expected gradient does not change.
 
     A pixel gets its samples in groups of ``spp``, so that structured samplers stay stratified.
 
@@ -41,7 +41,10 @@ class LossSamples:
         places = (np.arange(share.size) + np.random.default_rng(seed).random()) / share.size
         pixels = np.searchsorted(np.cumsum(share), places * share.sum(), side="right")
         pixels = np.minimum(pixels, np.flatnonzero(share)[-1])
-        weights = share.sum() / (share[pixels] * share.size)
+        # A pixel that is certain to be sampled has the mean of its groups, whatever their number
+        counts = np.bincount(pixels, minlength=share.size)
+        expected = share / share.sum() * share.size
+        weights = 1 / np.where(expected < 1, expected, counts)[pixels]
 
         group = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
         lanes = PixelLanes(dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), group))

@@ -36,7 +36,8 @@ class RecursiveEstimate:
     .. math:: α_i = \frac{1 - δ/2}{1 + r_{i-1}}, \quad r_i = (1 - α_i)^2 + α_i δ + α_i^2 r_{i-1}.
 
     :math:`v` and :math:`d` are running means over the steps, averaged over a window of 9x9 pixels.
-    A weight that depended on single pixels would favour values of one sign.
+    A weight that depended on single pixels would favour values of one sign. Where a render has a
+    value that is not finite, the weight is 0, so that such values do not stay in the image.
 
     Source: B. Nicolet, F. Rousselle, J. Novák, A. Keller, W. Jakob, T. Müller, *Recursive Control
     Variates for Inverse Rendering*, ACM Transactions on Graphics 42(4), 2023. There, moments come
@@ -62,9 +63,11 @@ class RecursiveEstimate:
         if self._image is None:
             self._image, self.weight = rendered, dr.zeros(mi.TensorXf, rendered.shape)
         else:
-            change = rendered - self._control
-            self.weight = self._best_weight()
-            self._image = rendered + self.weight * (self._image - self._control)
+            change = _finite(rendered - self._control)
+            weight = self._best_weight()
+            correction = weight * (self._image - self._control)
+            self.weight = dr.select(dr.isfinite(correction), weight, 0)
+            self._image = rendered + _finite(correction)
             self._learn(change)
             self._change = change
         self._rendered = rendered
@@ -93,7 +96,7 @@ class RecursiveEstimate:
 
     def _learn(self, change: mi.TensorXf) -> None:
         """Updates the noise, and the variance of the image, with what this step shows."""
-        noise = 0.5 * _window_means(dr.square(self._rendered - self._control))
+        noise = 0.5 * _window_means(_finite(dr.square(self._rendered - self._control)))
         if self._steps == 0:
             self._noise = noise
             self._noise_of_change = _window_means(dr.square(change))
@@ -109,6 +112,10 @@ class RecursiveEstimate:
             dr.square(1 - α) + α * self._noise_ratio() + dr.square(α) * self._variance_ratio
         )
         self._steps += 1
+
+
+def _finite(image: mi.TensorXf) -> mi.TensorXf:
+    return dr.select(dr.isfinite(image), image, 0)
 
 
 def _window_means(image: mi.TensorXf) -> mi.TensorXf:

@@ -176,6 +176,21 @@ def test_a_step_that_is_interrupted_is_forgotten(monkeypatch: pytest.MonkeyPatch
     assert integrator.weight.numpy().max() == 0
 
 
+def test_values_that_are_not_finite_do_not_stay_in_the_image() -> None:
+    """A reflectance that is not a number in one step has no effect on the images of later ones."""
+    scene, integrator = small(), wrapped()
+    parameters, key = floor_of(scene)
+    for step in range(5):
+        parameters[key] = mi.Color3f(float("nan") if step == 1 else 0.5)
+        parameters.update()
+        image = mi.render(scene, integrator=integrator, seed=step, spp=4).numpy()
+        # The control variate of step 2 was rendered in step 1
+        assert np.isfinite(image).all() == (step != 1), step
+        weight = integrator.weight.numpy()
+        assert np.isfinite(weight).all()
+    assert (weight > 0.3).all()
+
+
 def test_what_composed_prb_learns_again_does_not_part_two_renders() -> None:
     """Both renders of equal random numbers know the same, so that they are equal."""
     lamps = {

@@ -116,6 +116,23 @@ def test_samples_are_where_the_loss_is() -> None:
     np.testing.assert_allclose(few[0], many[0], rtol=0.1)
 
 
+def test_pixels_that_are_certain_to_be_sampled_have_no_noise_of_their_number_of_samples() -> None:
+    """Under a sky alone, all samples of a pixel are equal."""
+    view = sensor(film=film(8, 6, pixel_format="luminance"))
+    scene = mi.load_dict({"type": "scene", "sensor": view, "sky": {"type": "constant"}})
+    parameters, by = mi.traverse(scene), integrator(gradient_samples="loss")
+    derivative = np.where(np.arange(48) % 5 == 0, -1.0, 1.7).reshape(6, 8, 1)
+    derivative[:3] = 0
+    for seed in range(3):
+        dr.enable_grad(parameters["sky.radiance.value"])
+        dr.set_grad(parameters["sky.radiance.value"], 0)
+        parameters.update()
+        weights = mi.TensorXf(derivative.astype(np.float32))
+        by.render_backward(scene, parameters, weights, seed=seed, spp=4)
+        found = dr.grad(parameters["sky.radiance.value"]).numpy().sum()
+        np.testing.assert_allclose(found, derivative.sum(), rtol=1e-4)
+
+
 def test_image_and_gradient_need_numbers_of_their_own() -> None:
     """The gradient of a squared error is a product of the image and its derivative. With the same
     random numbers, it contains their covariance."""
