@@ -314,9 +314,14 @@ def check_takes_splats(film: mi.Film) -> None:
         NotImplementedError: Splats cannot be added to this film.
     """
     if film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        remedy = (
+            ' with a sampled border: set its "sample_border" to False'
+            if film.sample_border()
+            else ': use "hdrfilm"'
+        )
         raise NotImplementedError(
             f'light that reaches other pixels cannot be added to the film "{film.class_name()}"'
-            f'{" with a sampled border" if film.sample_border() else ""}'
+            f"{remedy}"
         )
 
 

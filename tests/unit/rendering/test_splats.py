@@ -119,8 +119,8 @@ _SPECTRAL_FILM = {
 
 
 @pytest.mark.parametrize("variant, changes, says", [
-    ("llvm_ad_rgb", {"sample_border": True, **_GAUSSIAN}, "a sampled border"),
-    ("llvm_ad_spectral", _SPECTRAL_FILM, "SpecFilm"),
+    ("llvm_ad_rgb", {"sample_border": True, **_GAUSSIAN}, 'set its "sample_border" to False'),
+    ("llvm_ad_spectral", _SPECTRAL_FILM, 'SpecFilm": use "hdrfilm"'),
 ], ids=["border", "specfilm"], indirect=["variant"])  # fmt: skip
 def test_films_that_cannot_take_splats_are_named(
     variant: str, changes: dict[str, Any], says: str
