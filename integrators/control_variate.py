@@ -53,9 +53,9 @@ class ControlVariate(mi.AdjointIntegrator):
     .. math:: F_i = f_i + α_i (F_{i-1} - h_i)
 
     The weights α lie between 0 and 1 and minimize the variance of each pixel and channel, which is
-    estimated from earlier steps (:class:`RecursiveEstimate`). Where the parameters no longer
-    change, :math:`F_i` is the mean of all steps; where all changes, it is :math:`f_i`. It has the
-    expected value of the nested integrator's image. Unlike it, single pixels can be negative: use
+    estimated from earlier steps. Where the parameters no longer change, :math:`F_i` is the mean of
+    all steps; where all changes, it is :math:`f_i`. It has the expected value of the nested
+    integrator's image. Unlike it, single pixels can be negative: use
     :monosp:`dr.maximum(image, 0)` before a logarithm or a root. The errors of successive images are
     correlated. Gradients are the nested integrator's, from random numbers of their own.
 
