@@ -199,8 +199,9 @@ def _compare(scene: mi.Scene, integrator, reference, spp: int = 256, precision=0
     of=[(m, x) for m in MEDIA for x in LIGHTS if m != "thick" or "inside" not in x],
 ))  # fmt: skip
 def test_fog_has_the_mean_of_volpath(medium: str, light: str) -> None:
-    spp = 2048 if "inside" in light else 512
-    _compare(mi.load_dict(fog(light, MEDIA[medium]())), _make(), _volpath(), spp, 0.05)
+    # A point of light in a medium: the variance of both has no bound
+    spp, precision = (2048, 0.1) if "inside" in light else (512, 0.05)
+    _compare(mi.load_dict(fog(light, MEDIA[medium]())), _make(), _volpath(), spp, precision)
 
 
 def _glass_of_milk() -> dict:
