@@ -134,7 +134,7 @@ def trace(
 
 
 def trace_in_medium(
-    scene: mi.Scene, emission: LightEmission, sensor: mi.Sensor, count: int, lanes: int = 1024
+    scene: mi.Scene, emission: LightEmission, sensor: mi.Sensor, count: int, lanes: int = 4096
 ) -> Paths:
     """Paths whose ``count`` vertices all lie in the medium of the sensor, with any transmittances.
     """
