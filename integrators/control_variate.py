@@ -48,7 +48,7 @@ class ControlVariate(mi.AdjointIntegrator):
     single image gains nothing.
 
     **The image.** Step i renders the scene with the random numbers that step i-1 has announced, and
-    with those of the next step. With :math:`f_i` and :math:`h_{i+1}`, its image is
+    with the numbers of the next step. With :math:`f_i` and :math:`h_{i+1}`, its image is
 
     .. math:: F_i = f_i + α_i (F_{i-1} - h_i)
 

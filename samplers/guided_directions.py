@@ -66,7 +66,7 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     direction of the path, so that equal numbers lead to other directions in each path. The trees of
     media are therefore over directions in space, of which at least a fifth is drawn from the phase
     function. How far a path flies before it scatters is not guided (but see :class:`swarm_path`).
-    With tiles, the numbers of phase functions are guided like those of BSDFs.
+    With tiles, the numbers of phase functions are guided like the numbers of BSDFs.
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, to no effect). With regions of surfaces, Russian roulette is learned as

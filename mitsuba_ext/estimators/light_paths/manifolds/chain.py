@@ -137,7 +137,7 @@ class Chains:
         return sound
 
     def _weigh(self, state, ray, pi, transmit, sound, weighs: bool) -> None:
-        """Multiplies the weight and the chance of ``state`` by those of the surface it has met."""
+        """Multiplies weight and chance of ``state`` by the values of the surface it has met."""
         if not weighs:
             return
         hit = pi.compute_surface_interaction(ray, mi.RayFlags.All, sound)
