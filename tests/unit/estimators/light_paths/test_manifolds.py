@@ -439,8 +439,9 @@ def test_the_same_seed_gives_the_same_image() -> None:
     gc.collect()  # as above
     scene = _scene(**_statistical()["ball"])
     first = _render(scene, 16, seed=3)
-    np.testing.assert_array_equal(first, _render(scene, 16, seed=3))
-    assert (first != _render(scene, 16, seed=4)).any()
+    # Up to the order in which two threads add samples to a pixel
+    np.testing.assert_allclose(first, _render(scene, 16, seed=3), rtol=1e-5)
+    assert (abs(first - _render(scene, 16, seed=4)) > 1e-3 * first).any()
 
 
 # ---- Refusals ----
