@@ -20,6 +20,7 @@ def mean() -> np.ndarray:
     return np.random.default_rng(1).uniform(0.2, 2.0, (18, 32, 3))
 
 
+@pytest.mark.slow
 def test_equal_means_agree(mean: np.ndarray) -> None:
     """No z score is larger than expected of this number of normal variables."""
     for seed in range(60):

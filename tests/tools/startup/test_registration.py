@@ -86,6 +86,7 @@ def test_every_class_that_derives_from_mitsuba_is_variant_bound() -> None:
     assert not others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [

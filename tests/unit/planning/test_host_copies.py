@@ -29,6 +29,7 @@ def copied(monkeypatch) -> list[int]:
     return sizes
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_no_copy_of_learned_lights_grows_with_the_film(copied: list[int]) -> None:
     """An image of the larger film has 81 KiB in single precision."""

@@ -251,6 +251,7 @@ def test_black_objects_have_a_gradient() -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_image_agrees_with_composed_path_and_later_renders_learn_nothing() -> None:
     scene = load("rooms", width=48, height=27)
     ours, path = (

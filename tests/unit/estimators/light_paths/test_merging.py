@@ -123,7 +123,7 @@ def test_a_sensor_of_one_ray_has_the_radiance_of_path(name: str) -> None:
     assert means[0] == pytest.approx(means[1], rel=0.1)
 
 
-@pytest.mark.parametrize("radius", [0.8, 0.4])
+@pytest.mark.parametrize("radius", [pytest.param(0.8, marks=pytest.mark.slow), 0.4])
 def test_the_bias_is_the_mean_over_a_disk(radius: float) -> None:
     """Light of a point at height 1 falls as (1 + d²)^(-3/2) with the distance from below it."""
     T = mi.ScalarTransform4f
