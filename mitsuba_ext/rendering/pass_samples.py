@@ -10,6 +10,7 @@ from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import frozen
 from . import camera
+from .mask_samples import LabelledSamples, Labels
 
 
 class GradientsError(Exception):
@@ -28,7 +29,8 @@ def put_samples(
     weight: mi.Float | float,
     block: mi.ImageBlock,
     tally: mi.UInt64,
-) -> None:
+    labels: Labels | None,
+) -> LabelledSamples | None:
     """Takes the samples of a pass, and puts them into a block. Kernels have the width of the lanes,
     whatever the width of tables. They read the state of the sampler, which has the same width.
 
@@ -38,13 +40,20 @@ def put_samples(
         spp: Samples per pixel of the whole render.
         weight: The weight of each sample.
         tally: Counts of rays, to which the rays of the pass are added.
+        labels: Labels the samples for masks; ``None`` if there are none.
+
+    Returns:
+        The labelled samples, if there are masks.
 
     Raises:
         GradientsError: The radiance has gradients.
     """
-    rays, sample = _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)
+    rays = _rays(samples, sensor, sampler, lanes, spp)
+    labelled = None if labels is None else labels.of(scene, rays, weight)
+    sample = _estimated(estimator, scene, sampler, rays)
     camera.put(sensor.film(), block, rays, sample, sample.aovs, weight)
     count_rays(tally, sample)
+    return labelled
 
 
 @frozen(any_width=True)
@@ -59,22 +68,17 @@ def look(
 ) -> mi.Spectrum:
     """The radiance of samples from which observers learn. They are not added to the film. The
     parameters, and what is raised, are as for :func:`put_samples`."""
-    return _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)[1].L
+    rays = _rays(samples, sensor, sampler, lanes, spp)
+    return _estimated(estimator, scene, sampler, rays).L
 
 
-def _sampled(
-    estimator: Estimator,
-    samples: CameraSamples,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    sampler: mi.Sampler,
-    lanes: camera.PassLanes,
+def _rays(
+    samples: CameraSamples, sensor: mi.Sensor, sampler: mi.Sampler, lanes: camera.PassLanes,
     spp: int,
-) -> tuple[CameraRays, Sample]:
+) -> CameraRays:  # fmt: skip
     taken = lanes.lanes(sensor.film())
     numbers = camera.draw_numbers(sensor, sampler, taken, samples)
-    rays = camera.camera_rays(sensor, taken, numbers, spp)
-    return rays, _estimated(estimator, scene, sampler, rays)
+    return camera.camera_rays(sensor, taken, numbers, spp)
 
 
 @frozen(any_width=True)

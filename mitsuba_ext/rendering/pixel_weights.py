@@ -5,6 +5,10 @@ with open addressing, whose keys are pairs of a pixel and a label. A kernel find
 with atomic compare-and-swap operations. Weights are added as integers: their sum does not depend on
 the order, so the same samples always give exactly the same result.
 
+Samples of a pixel follow each other, and most have the same label. A lane of the kernel therefore
+adds up a run of samples for one of the pixels around them, and looks for a slot only where the key
+changes.
+
 Source: D. E. Knuth, *The Art of Computer Programming*, volume 3, section 6.4 (open addressing).
 """
 
@@ -21,6 +25,9 @@ ONE, _MOST = 2.0**20, 2000.0
 
 #: Slots for each pixel at the start. Keys of a pixel are there first, and then anywhere.
 _SLOTS = 2
+
+#: The length of the runs of samples that a lane adds up.
+_RUN = 16
 
 #: The number of slots after which the search for a key gives up, and the table grows.
 _MOST_ATTEMPTS = 32
@@ -132,40 +139,54 @@ class PixelWeights:
 
     @dr.syntax
     def _put(self, sizes, known, keys, sums, lost, position, weight, label):
-        center = position - self._offset - 0.5
-        radius = self._filter.radius()
-        side = 1 if self._filter.is_box_filter() else int(np.ceil(2 * radius))
-        # The pixels that the filter covers, as in ``ImageBlock::put``
-        if dr.hint(side == 1, mode="scalar"):
-            first = mi.Point2i(dr.floor(position - self._offset))
-        else:
-            first = mi.Point2i(dr.ceil(center - radius))
-        width, height = mi.Int32(sizes.width), mi.Int32(sizes.height)
-        index, attempt = mi.UInt32(0), mi.UInt32(0)
-        active = weight != 0
+        # How far from its own pixel a sample counts, and the pixels around that
+        reach = int(np.ceil(self._filter.radius() - 0.5))
+        side = 2 * reach + 1
+        count = dr.width(position, weight, label)
+        end = dr.opaque(mi.UInt32, count)
+        lane = dr.arange(mi.UInt32, -(-count // _RUN) * side * side)
+        run = lane // (side * side)
+        around = lane - run * (side * side)
+        row = around // side
+        away = mi.Point2f(mi.Point2i(mi.Int32(around - row * side), mi.Int32(row)) - reach)
+        index, left = run * _RUN, mi.UInt32(_RUN)
+        key, total = self._type(self._empty), mi.UInt64(0)
+        active = mi.Bool(True)
         while active:
-            row = index // side
-            pixel = first + mi.Point2i(mi.Int32(index - row * side), mi.Int32(row))
-            away = mi.Point2f(pixel) - center
-            share = weight
+            exists = (left > 0) & (index < end)
+            p = dr.gather(mi.Point2f, position, index, exists) - self._offset
+            pixel = dr.floor(p) + away
+            share = dr.gather(mi.Float, weight, index, exists)
             if dr.hint(side > 1, mode="scalar"):
-                share = weight * self._filter.eval(away.x) * self._filter.eval(away.y)
-            covers = (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
-            covers &= (share != 0)
-            number = mi.UInt32(pixel.y * width + pixel.x)
-            key = self._type(number) * self._type(sizes.label_count) + self._type(label)
-            slot, is_mine = self._claimed(
-                sizes, known, keys, number, key, attempt, active & covers
-            )
-            value = mi.UInt64(mi.Int64(mi.Int32(dr.round(dr.clip(share, -_MOST, _MOST) * ONE))))
-            dr.scatter_add(sums, value, slot, is_mine)
+                from_center = pixel - p + 0.5
+                share *= self._filter.eval(from_center.x) * self._filter.eval(from_center.y)
+            x, y = mi.Int32(pixel.x), mi.Int32(pixel.y)
+            covers = exists & (share != 0) & (x >= 0) & (y >= 0)
+            covers &= (mi.UInt32(x) < sizes.width) & (mi.UInt32(y) < sizes.height)
+            number = mi.UInt32(y) * sizes.width + mi.UInt32(x)
+            its_label = dr.gather(mi.UInt32, label, index, exists)
+            its_key = self._type(number) * self._type(sizes.label_count) + self._type(its_label)
+            ends = (covers & (its_key != key)) | ~exists
+            if ends & (key != self._empty):
+                self._add(sizes, known, keys, sums, lost, key, total)
+            share = dr.round(dr.clip(share, -_MOST, _MOST) * ONE)
+            value = dr.select(covers, mi.UInt64(mi.Int64(mi.Int32(share))), 0)
+            total = dr.select(ends, value, total + value)
+            key = dr.select(covers, its_key, key)
+            index, left, active = index + 1, left - 1, active & exists
+
+    @dr.syntax
+    def _add(self, sizes, known, keys, sums, lost, key, total):
+        """Adds a sum to the slot of its key."""
+        pixel = mi.UInt32(key // self._type(sizes.label_count))
+        attempt, active = mi.UInt32(0), mi.Bool(True)
+        while active:
+            slot, is_mine = self._claimed(sizes, known, keys, pixel, key, attempt, active)
+            dr.scatter_add(sums, total, slot, is_mine)
             gives_up = attempt == _MOST_ATTEMPTS
-            if active & covers & gives_up & ~is_mine:
-                dr.scatter(lost, mi.UInt32(1), mi.UInt32(0))
-            is_next = is_mine | gives_up | ~covers
-            attempt = dr.select(is_next, 0, attempt + 1)
-            index = dr.select(is_next, index + 1, index)
-            active &= index < side * side
+            dr.scatter(lost, mi.UInt32(1), mi.UInt32(0), active & gives_up & ~is_mine)
+            attempt += 1
+            active &= ~is_mine & ~gives_up
 
     @dr.syntax
     def _move(self, sizes, empty, old_keys, old_sums, keys, sums, lost):

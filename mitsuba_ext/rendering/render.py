@@ -325,15 +325,19 @@ class Job:
             return
         self._begin(stage, lanes)
         weight = 1.0 if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
-        put_samples(
+        labelled = put_samples(
             stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
-            self.plan.spp, weight, self.block, self.tally,
+            self.plan.spp, weight, self.block, self.tally, self.masks and self.masks.labels,
         )  # fmt: skip
+        if labelled is not None:
+            self.masks.taken.append(labelled)
         self._finish_take(sampler)
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        return not self._has_ray_aovs and self.masks is None and self._is_walk_frozen(stage)
+        if self._has_ray_aovs or (self.masks and not self.masks.labels.can_be_frozen):
+            return False
+        return self._is_walk_frozen(stage)
 
     def _is_walk_frozen(self, stage: Stage) -> bool:
         """Whether the estimator of this stage is recorded, if not the whole pass."""
@@ -380,7 +384,7 @@ class Job:
         if self.masks is not None:
             # Before the samples of the image: a BSDF that is asked for its transmission may read
             # an array on the host, which evaluates the samples in the block so far
-            self.masks.take(rays, count)
+            self.masks.taken.append(self.masks.labels.of(self.scene, rays, count))
         if stage.observer is not None:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))

@@ -25,6 +25,7 @@ class CameraRays:
         medium: The participating medium in which the rays begin; ``None`` in a vacuum.
         distance: The primary sample that chooses the first distance in a homogeneous medium;
             ``None`` if the sampler chooses it.
+        first: The first surface that each ray meets; ``None`` if it is not known.
     """
 
     ray: mi.RayDifferential3f
@@ -35,6 +36,7 @@ class CameraRays:
     hero_weight: mi.Float | float = 1.0
     medium: mi.Medium | None = None
     distance: mi.Float | None = None
+    first: mi.PreliminaryIntersection3f | None = None
 
 
 @dataclass

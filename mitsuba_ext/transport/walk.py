@@ -23,6 +23,7 @@ from .connection import Connection, Connector, can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes
+from .media import NoMedia
 from .numbers import schedule_state
 from .observer import Observer
 from .path_channels import PathChannels
@@ -175,7 +176,7 @@ class Walk:
 
         inside = media.begin(sampler, rays)
         ray, inside = media.launch(inside, path.β, sampler, rays, ray, active)
-        pi = self.query.closest(scene, ray, coherent=media.coherent, active=active)
+        pi = self._first(scene, rays, ray, media, active)
         if dr.hint(self.hide_emitters, mode="scalar"):
             ray, pi = media.behind(self.query, scene, ray, pi, active)
 
@@ -337,6 +338,13 @@ class Walk:
     def clamps(self) -> bool:
         """Whether light is clamped, so that the image is biased."""
         return self.clamp_direct > 0 or self.clamp_indirect > 0
+
+    def _first(self, scene, rays: CameraRays, ray, media: NoMedia, active):
+        """The first surface that each path meets."""
+        # Rays in media may be shorter than the camera rays
+        if rays.first is None or media.exist:
+            return self.query.closest(scene, ray, coherent=media.coherent, active=active)
+        return dr.copy(rays.first)  # the loop of the walk changes it
 
     def _visit(self, connects: bool, state, scene, si, active):
         """What the next event decision knows about a vertex."""

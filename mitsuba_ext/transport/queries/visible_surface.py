@@ -38,9 +38,14 @@ def first_surface(
 
 
 def visible_surface(
-    query: SceneQuery, scene: mi.Scene, ray: mi.Ray3f, names: SurfaceNames, hide_emitters: bool
+    query: SceneQuery,
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    names: SurfaceNames,
+    hide_emitters: bool,
 ) -> VisibleSurface:
-    """The surface that covers the pixel of each ray.
+    """The surface that covers the pixel of each ray, which meets ``pi`` first.
 
     Opacity masks, the BSDF ``null`` and filters of light are transparent: a ray passes through them
     with the probability of the light that passes straight on. Panes of ``thindielectric``, glass
@@ -49,8 +54,8 @@ def visible_surface(
     Parameters:
         hide_emitters: Whether rays pass through area lights.
     """
-    ray = mi.Ray3f(ray)
-    pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
+    # A loop changes the objects of its state
+    ray, pi = mi.Ray3f(ray), dr.copy(pi)
     if hide_emitters:
         ray, pi = behind_emitters(query, scene, ray, pi, mi.Bool(True))
     if names.transparent is not None:

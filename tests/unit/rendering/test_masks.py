@@ -205,6 +205,11 @@ def test_hidden_lights_are_not_in_masks() -> None:
     hidden = _mattes(scene, hide_emitters=True)
     assert shown.max() == 1 and _matte(hidden, "o", "lamp").max() == 0
     assert _matte(hidden, "o", "back")[shown == 1].min() == 1
+    with_masks, without = (
+        np.array(_integrator(aovs, hide_emitters=True).render(scene, spp=4, seed=5))[..., :3]
+        for aovs in ("o:object_id", "")
+    )
+    np.testing.assert_allclose(with_masks, without, atol=1e-5)
 
 
 def test_an_empty_scene_has_empty_masks() -> None:
@@ -320,7 +325,7 @@ def test_single_samples_have_no_masks() -> None:
 
 
 def test_without_masks_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mask_samples.MaskSamples, "take", None)
+    monkeypatch.setattr(mask_samples.Labels, "of", None)
     monkeypatch.setattr(mask_samples, "surface_names", None)
     integrator = _integrator("d:depth")
     integrator.render(_load(_scene()), spp=1)
