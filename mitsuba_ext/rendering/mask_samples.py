@@ -50,12 +50,6 @@ class Labels:
     materials: tuple[str, ...]
 
     @property
-    def can_be_frozen(self) -> bool:
-        """Whether the labels of a pass may be recorded (``frozen.py``). A BSDF that is asked for
-        its transmission may read an array on the host."""
-        return self.names.transparent is None
-
-    @property
     def count(self) -> int:
         """The number of labels."""
         return (len(self.objects) + 1) * (len(self.materials) + 1)

@@ -335,9 +335,7 @@ class Job:
 
     def _is_frozen(self, stage: Stage) -> bool:
         """Whether the passes of this stage are recorded (``frozen.py``)."""
-        if self._has_ray_aovs or (self.masks and not self.masks.labels.can_be_frozen):
-            return False
-        return self._is_walk_frozen(stage)
+        return not self._has_ray_aovs and self._is_walk_frozen(stage)
 
     def _is_walk_frozen(self, stage: Stage) -> bool:
         """Whether the estimator of this stage is recorded, if not the whole pass."""
