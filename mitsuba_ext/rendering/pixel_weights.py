@@ -6,8 +6,8 @@ with atomic compare-and-swap operations. Weights are added as integers: their su
 the order, so the same samples always give exactly the same result.
 
 Samples of a pixel follow each other, and most have the same label. A lane of the kernel therefore
-adds up a run of samples for one of the pixels around them, and looks for a slot only where the key
-changes.
+adds up a run of samples for one row of the pixels around them, and looks for slots only where the
+pixel or the label changes.
 
 Source: D. E. Knuth, *The Art of Computer Programming*, volume 3, section 6.4 (open addressing).
 """
@@ -139,54 +139,58 @@ class PixelWeights:
 
     @dr.syntax
     def _put(self, sizes, known, keys, sums, lost, position, weight, label):
-        # How far from its own pixel a sample counts, and the pixels around that
+        # How far from its own pixel a sample counts. Each lane has one row of the pixels around it
         reach = int(np.ceil(self._filter.radius() - 0.5))
         side = 2 * reach + 1
         count = dr.width(position, weight, label)
         end = dr.opaque(mi.UInt32, count)
-        lane = dr.arange(mi.UInt32, -(-count // _RUN) * side * side)
-        run = lane // (side * side)
-        around = lane - run * (side * side)
-        row = around // side
-        away = mi.Point2f(mi.Point2i(mi.Int32(around - row * side), mi.Int32(row)) - reach)
+        lane = dr.arange(mi.UInt32, -(-count // _RUN) * side)
+        run = lane // side
+        row = mi.Int32(lane - run * side) - reach
         index, left = run * _RUN, mi.UInt32(_RUN)
-        key, total = self._type(self._empty), mi.UInt64(0)
+        # What the samples of the run have in common so far, and the sums for the pixels of the row
+        pixel, run_label, totals = mi.Point2i(0), mi.UInt32(0), [mi.UInt64(0) for _ in range(side)]
         active = mi.Bool(True)
         while active:
             exists = (left > 0) & (index < end)
             p = dr.gather(mi.Point2f, position, index, exists) - self._offset
-            pixel = dr.floor(p) + away
-            share = dr.gather(mi.Float, weight, index, exists)
-            if dr.hint(side > 1, mode="scalar"):
-                from_center = pixel - p + 0.5
-                share *= self._filter.eval(from_center.x) * self._filter.eval(from_center.y)
-            x, y = mi.Int32(pixel.x), mi.Int32(pixel.y)
-            covers = exists & (share != 0) & (x >= 0) & (y >= 0)
-            covers &= (mi.UInt32(x) < sizes.width) & (mi.UInt32(y) < sizes.height)
-            number = mi.UInt32(y) * sizes.width + mi.UInt32(x)
+            its_pixel = mi.Point2i(dr.floor(p))
+            its_pixel.y += row
             its_label = dr.gather(mi.UInt32, label, index, exists)
-            its_key = self._type(number) * self._type(sizes.label_count) + self._type(its_label)
-            ends = (covers & (its_key != key)) | ~exists
-            if ends & (key != self._empty):
-                self._add(sizes, known, keys, sums, lost, key, total)
-            share = dr.round(dr.clip(share, -_MOST, _MOST) * ONE)
-            value = dr.select(covers, mi.UInt64(mi.Int64(mi.Int32(share))), 0)
-            total = dr.select(ends, value, total + value)
-            key = dr.select(covers, its_key, key)
+            share = dr.gather(mi.Float, weight, index, exists)
+            from_center = mi.Point2f(its_pixel) - p + 0.5
+            if dr.hint(side > 1, mode="scalar"):
+                share *= self._filter.eval(from_center.y)
+            ends = ~exists | dr.any(its_pixel != pixel) | (its_label != run_label)
+            if ends:
+                self._add_row(sizes, known, keys, sums, lost, pixel, run_label, totals)
+            for column in range(side):
+                x = from_center.x + (column - reach)
+                value = share * self._filter.eval(x) if side > 1 else share
+                totals[column] = dr.select(ends, 0, totals[column]) + _fixed(value)
+            pixel, run_label = its_pixel, its_label
             index, left, active = index + 1, left - 1, active & exists
 
     @dr.syntax
-    def _add(self, sizes, known, keys, sums, lost, key, total):
-        """Adds a sum to the slot of its key."""
-        pixel = mi.UInt32(key // self._type(sizes.label_count))
-        attempt, active = mi.UInt32(0), mi.Bool(True)
+    def _add_row(self, sizes, known, keys, sums, lost, pixel, label, totals):
+        """Adds sums to the slots of the pixels in a row, whose middle is ``pixel``."""
+        left, side = list(totals), len(totals)
+        column, attempt, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(True)
         while active:
-            slot, is_mine = self._claimed(sizes, known, keys, pixel, key, attempt, active)
-            dr.scatter_add(sums, total, slot, is_mine)
+            # Negative numbers are large ones here
+            x, y = mi.UInt32(pixel.x - side // 2) + column, mi.UInt32(pixel.y)
+            exists = active & (left[0] != 0) & (x < sizes.width) & (y < sizes.height)
+            number = y * sizes.width + x
+            key = self._type(number) * self._type(sizes.label_count) + self._type(label)
+            slot, is_mine = self._claimed(sizes, known, keys, number, key, attempt, exists)
+            dr.scatter_add(sums, left[0], slot, is_mine)
             gives_up = attempt == _MOST_ATTEMPTS
-            dr.scatter(lost, mi.UInt32(1), mi.UInt32(0), active & gives_up & ~is_mine)
-            attempt += 1
-            active &= ~is_mine & ~gives_up
+            dr.scatter(lost, mi.UInt32(1), mi.UInt32(0), exists & gives_up & ~is_mine)
+            is_next = is_mine | gives_up | ~exists
+            left = _rotated(left, is_next)
+            attempt = dr.select(is_next, 0, attempt + 1)
+            column += dr.select(is_next, 1, 0)
+            active &= column < side
 
     @dr.syntax
     def _move(self, sizes, empty, old_keys, old_sums, keys, sums, lost):
@@ -200,3 +204,13 @@ class PixelWeights:
             dr.scatter(lost, mi.UInt32(1), mi.UInt32(0), active & gives_up & ~is_mine)
             attempt += 1
             active &= ~is_mine & ~gives_up
+
+
+def _rotated(numbers: list[mi.UInt64], active: mi.Bool) -> list[mi.UInt64]:
+    """The list with the second element first, in ``active`` lanes."""
+    return [dr.select(active, b, a) for a, b in zip(numbers, numbers[1:] + numbers[:1])]
+
+
+def _fixed(weight: mi.Float) -> mi.UInt64:
+    """A weight as an integer."""
+    return mi.UInt64(mi.Int64(mi.Int32(dr.round(dr.clip(weight, -_MOST, _MOST) * ONE))))
