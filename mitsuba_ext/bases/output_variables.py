@@ -12,8 +12,9 @@ from ..scene.expressions.notation import Expression
 from ..scene.light_groups import light_groups
 from ..scene.surface_names import SurfaceNames, surface_names
 from ..scene.unseen import has_unseen_shapes
-from ..transport.path_channels import PathChannels, colour_names
+from ..transport.path_channels import PathChannels
 from ..transport.queries.aovs import output_variables
+from ..util.spectra import colour_names
 
 
 class OutputVariables:

@@ -12,8 +12,7 @@ import mitsuba as mi
 from ..transport.decisions import CameraSamples
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
-from ..transport.path_channels import film_colours
-from ..util.spectra import to_rgb
+from ..util.spectra import film_colours, to_rgb
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

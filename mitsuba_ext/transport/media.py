@@ -336,7 +336,7 @@ class Media(NoMedia):
         depth = dr.select(passes, before.depth, path.depth)
         return PathState(
             path.β, path.η, path.sampling_weight, depth, arrival, path.hero_is_alone,
-            path.history, path.events,
+            path.history, path.events, path.sums,
         )
 
     def is_within(self, depth, max_depth, active):

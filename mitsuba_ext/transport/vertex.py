@@ -41,7 +41,8 @@ class PathState:
         history: What the program of the walk knows of the path so far
             (:class:`.path_program.PathProgram`); ``None`` if it needs nothing.
         events: The state of the automaton that reads the path
-            (:class:`.path_channels.PathChannels`); ``None`` without light path expressions.
+            (:class:`.path_events.PathEvents`); ``None`` without light path expressions.
+        sums: The light that the path has brought to each cell of the automaton.
     """
 
     β: mi.Spectrum
@@ -52,6 +53,7 @@ class PathState:
     hero_is_alone: mi.Bool | None
     history: Any = None
     events: Any = None
+    sums: Any = None
 
 
 @dataclass

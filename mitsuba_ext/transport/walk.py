@@ -24,7 +24,6 @@ from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes
 from .media import NoMedia
-from .numbers import schedule_state
 from .observer import Observer
 from .path_channels import PathChannels
 from .path_decisions import (
@@ -108,13 +107,7 @@ class Walk:
         """The samples, not clamped, and the direct light in each of them (``None`` where nothing
         :attr:`clamps`)."""
         with garbage_left_alone():
-            sample, direct = self._trace(scene, sampler, rays, active)
-        if self.channels is not None:
-            # The sums of the channels are complete when the kernel of the samples has run
-            schedule_state(sampler)
-            dr.eval(sample, rays.position, rays.importance, rays.weight, rays.ray.wavelengths)
-            sample.aovs = self.channels.values(rays)
-        return sample, direct
+            return self._trace(scene, sampler, rays, active)
 
     def clamped(self, sample: Sample, direct: mi.Spectrum | None) -> Sample:
         """``sample``, clamped. ``direct`` is its direct light."""
@@ -161,7 +154,8 @@ class Walk:
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
             history=self.program.begin(ray),
-            events=None if self.channels is None else self.channels.begin(rays),
+            events=self.channels and self.channels.begin(),
+            sums=self.channels and self.channels.sums(),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Whether it has met anything
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -301,6 +295,7 @@ class Walk:
                 history=history,
                 events=self.channels
                 and self.channels.left(vertex, bs, sample_weight, active_next),
+                sums=path.sums,
             )
             path = media.leave(vertex, bs, onward)
             active_next = media.is_within(path.depth, self.max_depth, active_next)
@@ -332,7 +327,10 @@ class Walk:
         self.observer.end(L)
         if replays_media:
             self.replay.end(detour, L)
-        return Sample(L, valid, scatter_count, shadow_count, connection_count), direct
+        sample = Sample(L, valid, scatter_count, shadow_count, connection_count)
+        if self.channels is not None:
+            sample.aovs = self.channels.values(path.sums, rays)
+        return sample, direct
 
     @property
     def clamps(self) -> bool:

@@ -31,6 +31,16 @@ def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
     return mi.Color3f(L.x) if mi.is_monochromatic else L
 
 
+def colour_names() -> str:
+    """The letters of the colours that an expression has in the film."""
+    return "Y" if mi.is_monochromatic else "RGB"
+
+
+def film_colours(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> list[mi.Float]:
+    """Radiance as these colours."""
+    return list(to_rgb(L, wavelengths))[: len(colour_names())]
+
+
 def load_tables() -> None:
     """Makes Mitsuba load the tables of :func:`to_rgb`. Their first use evaluates all that learners
     have recorded so far: the first render of a process would launch the walk for these records,

@@ -100,10 +100,10 @@ class ManifoldConnections:
     def gather(
         self, vertices: ChosenVertices, rays: CameraRays, channels: PathChannels | None,
         records: bool,
-    ) -> tuple[mi.Spectrum, mi.UInt32, ChainRecords | None]:
-        """The radiance of one connection for each path, throughput included, which is added to
-        the channels of light path expressions; the number of shadow rays; and the chains, if they
-        are recorded.
+    ) -> tuple[mi.Spectrum, list[mi.Spectrum], mi.UInt32, ChainRecords | None]:
+        """The radiance of one connection for each path, throughput included; the part that each
+        channel of a light path expression gains; the number of shadow rays; and the chains, if
+        they are recorded.
 
         Each step is a kernel of its own, with lanes only for paths for which there is something to
         do."""
@@ -131,14 +131,13 @@ class ManifoldConnections:
         dr.eval(light_of_path, shadow_count, cells, first)
         trials = self._solver.count(tasks, Queue(dr.max(dr.abs(light_of_path)) > 0), found)
         L = light_of_path * mi.Float(trials)
-        if channels is not None:
-            channels.add(cells, L)
+        parts = [] if channels is None else channels.parts(cells, L)
         if not records:
-            return L, shadow_count, None
+            return L, parts, shadow_count, None
         pattern = (found.length << 2) | found.transmits
         weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
         chains = ChainRecords(chosen.si.p, target.p, first, pattern, weight, trials)
-        return L, shadow_count, chains
+        return L, parts, shadow_count, chains
 
     def _chosen(
         self, vertices: ChosenVertices, rays: CameraRays, path: mi.UInt32, active: mi.Bool

@@ -132,11 +132,11 @@ class ManifoldTracer:
         sample, direct = walk.unclamped(scene, sampler, rays, active)
         vertices.schedule()
         dr.eval(sample, direct)
-        L, tested, chains = self.connections.gather(vertices, rays, channels, records)
+        L, parts, tested, chains = self.connections.gather(vertices, rays, channels, records)
         sample = replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)
         if channels is not None:
-            dr.eval(sample)
-            sample.aovs = channels.values(rays)
+            gained = channels.colours_of(parts, rays)
+            sample.aovs = [value + more for value, more in zip(sample.aovs, gained)]
         return walk.clamped(sample, direct), chains
 
 

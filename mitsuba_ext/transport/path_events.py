@@ -1,0 +1,388 @@
+"""Light path expressions in the random walk: each path keeps the state of the automaton that reads
+its events (``scene/expressions``).
+
+**What an event is.** Media scatter with ``V``. At a surface, the two directions give the type:
+``R`` if they are on one side of the surface, otherwise ``T``. The lobe gives the scattering. Delta
+lobes (``S``, or ``s`` where light goes straight on) are found by sampling only, so that the lobe is
+known. Other lobes are found in two ways: by sampling, and by connections, which evaluate all lobes
+together. MIS weights are for the sum of the lobes. What is diffuse about a pair of directions must
+therefore follow from this pair alone: it is the share of the diffuse lobes in the value of the BSDF
+(:func:`.bsdfs.diffuse_share`), for each colour.
+
+- A connection is divided by this share, and belongs to two cells.
+- A sampled direction cannot be divided: the path goes on with one state. It chooses one. Each
+  colour takes ``D`` with the probability of its share, and otherwise ``G``. All colours use the
+  same random number. The expected channel is the same as if the path had been divided, each colour
+  has its full value in one of the channels, and MIS weights are right because the probability is a
+  function of the two directions.
+
+Channels are thus what a scene without the other lobes would show, with the same sampling, and a
+partition of all paths adds up to the image, sample by sample.
+
+Random numbers come from a hash of the position and the direction. The sampler's numbers, and with
+them the image, are the same as without expressions.
+
+**Tables.** Kernels look up one word for all kinds of lobes: a *column* is what happens at a vertex
+except for the lobe, and the word of a state and a column has the next state for each kind.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..scene.bsdfs import mixes_lobes, undivided_bsdfs
+from ..scene.expressions.alphabet import PER_CLASS, STRAIGHT, VOLUME, Alphabet
+from ..scene.expressions.automaton import MOST_STATES, Automaton
+from ..scene.expressions.notation import Expression
+from ..util.arrays import from_numpy
+from .bsdfs import diffuse_share
+from .heroes import Heroes
+from .vertex import MediumVertex, PathState, Vertex
+
+#: The kinds of lobes, in the order of the alphabet's symbols, and their number.
+_DIFFUSE, _GLOSSY, _SPECULAR, _KINDS = 0, 1, 2, 3
+
+#: The columns of a class of surfaces: ``R`` and ``T``, and two that do not depend on the surface.
+_TRANSMITS, _SCATTERS, _PASSES, _COLUMNS = 1, 2, 3, 4
+
+#: The bits of a state and of a cell in a word.
+_STATE_BITS, _CELL_BITS = 10, 16
+assert MOST_STATES <= 1 << _STATE_BITS
+
+#: The most words of the table of connections.
+_MOST_WORDS = 1 << 24
+
+
+# Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
+class PathEvents:
+    """Follows the events of camera paths and light paths. The state of a path is a list: one state
+    for all colours, or a state for each of them. A path belongs to a *cell* of the automaton, the
+    set of its expressions; cell 0 is none.
+
+    Parameters:
+        scene: The scene.
+        expressions: The expressions.
+
+    Raises:
+        ValueError: A label of an expression is not in the scene, or the expressions are too
+            complex.
+    """
+
+    def __init__(self, scene: mi.Scene, expressions: Sequence[Expression]) -> None:
+        alphabet = Alphabet.of(scene, expressions)
+        automaton = Automaton.of(expressions, alphabet.vertices, alphabet.lights)
+        self._light_class, self._surface_class = alphabet.light_class, alphabet.surface_class
+        self.cells = automaton.cells
+        steps, back = (_by_kind(table) for table in (automaton.next, automaton.back))
+        self._columns, self._lights = steps.shape[1], len(alphabet.lights)
+        self._steps, self._back = (
+            _packed(np.moveaxis(table, 2, 0), _STATE_BITS) for table in (steps, back)
+        )
+        if steps[..., 0].size * self._lights > _MOST_WORDS or len(self.cells) >> _CELL_BITS:
+            raise ValueError(
+                "the light path expressions need too large a table: render fewer expressions at "
+                "once, or name fewer lights and surfaces in them"
+            )
+        lit = automaton.ends[steps[..., :_SPECULAR]]
+        self._lit = _packed(np.moveaxis(lit, 2, 0), _CELL_BITS)
+        self._ends = from_numpy(mi.UInt32, automaton.ends)
+        self._begins = from_numpy(mi.UInt32, automaton.begins)
+        self._pairs, self._backs = from_numpy(mi.UInt32, automaton.pairs), len(back)
+        self._reads = len(steps) > 1
+        self._sees_lobes = any(
+            bool((table[..., _DIFFUSE] != table[..., _GLOSSY]).any()) for table in (steps, back)
+        )
+        self._mixes = self._sees_lobes and mixes_lobes(scene)
+        self._undivided = undivided_bsdfs(scene) if self._mixes else None
+        heroes = Heroes(scene)
+        self._ctx, self._disperses = heroes.context(), heroes.are_needed
+
+    @property
+    def colours(self) -> int:
+        """The number of states of a path."""
+        return len(mi.UnpolarizedSpectrum()) if self._mixes else 1
+
+    # ---- Along a camera path ----
+
+    def begin(self) -> list[mi.UInt32]:
+        """The state before the first vertex."""
+        return [mi.UInt32(0) for _ in range(self.colours)]
+
+    def left(
+        self, vertex: Vertex, bs: mi.BSDFSample3f, weight: mi.Spectrum, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The state behind ``vertex``, in the direction ``bs`` that was sampled there. ``weight``
+        is the BSDF's value in this direction / density."""
+        if not self._reads:
+            return vertex.path.events
+        return self._sampled(self._steps, vertex, bs, bs.wo, weight * bs.pdf, active)
+
+    def at_light(self, path: PathState, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
+        """The cells of a path that hits a light."""
+        return self._ended(path.events, _looked_up(self._light_class, emitter))
+
+    def at_connection(
+        self, vertex: Vertex, wo: mi.Vector3f, emitter: mi.EmitterPtr
+    ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
+        """The cells of a path whose last ``vertex`` was connected to a light, in the direction
+        ``wo``: if it scatters with a diffuse lobe there, and with a glossy one."""
+        light = _looked_up(self._light_class, emitter)
+        if not self._reads:
+            cells = self._ended(vertex.path.events, light)
+            return cells, cells
+        column = self._column(vertex, wo)
+        words = [
+            dr.gather(mi.UInt32, self._lit, (s * self._columns + column) * self._lights + light)
+            for s in vertex.path.events
+        ]
+        mask = (1 << _CELL_BITS) - 1
+        return [word & mask for word in words], [word >> _CELL_BITS for word in words]
+
+    # ---- Along a light path ----
+
+    def begin_light(self, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
+        """The state of the backward automaton behind a light."""
+        state = dr.gather(mi.UInt32, self._begins, _looked_up(self._light_class, emitter))
+        return [mi.UInt32(state) for _ in range(self.colours)]
+
+    def left_by_light(
+        self, vertex: Vertex, bs: mi.BSDFSample3f, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The state of a light path behind ``vertex``, in the direction ``bs`` that was sampled
+        there."""
+        if self._backs == 1:
+            return vertex.path.events
+        reverse = _reversed(vertex, bs.wo)
+        return self._sampled(self._back, reverse, bs, vertex.si.wi, None, active)
+
+    def past(
+        self, vertex: Any, to_camera: mi.Vector3f, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The state of a light path behind its last ``vertex``, in the direction in which it is
+        connected. ``vertex`` is a stored one."""
+        if self._backs == 1:
+            return vertex.events
+        at = Vertex(vertex.si, vertex.si.bsdf(), PathState(*[None] * 6, events=vertex.events))
+        if vertex.medium is not None:
+            in_medium = vertex.si.shape == None  # noqa: E711
+            at.medium = MediumVertex(in_medium, dr.zeros(mi.MediumInteraction3f))
+        reverse, wo = _reversed(at, to_camera), vertex.si.wi
+        words = self._words(self._back, vertex.events, self._column(reverse, wo))
+        return _states(words, self._chosen(reverse, wo, None, active & self._divides(words)))
+
+    # ---- Where a camera path meets a light path ----
+
+    def at_joint(
+        self, vertex: Vertex, wo: mi.Vector3f, others: list[mi.UInt32]
+    ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
+        """As :meth:`at_connection`, for a path that is joined with light paths in the states
+        ``others``."""
+        if not self._reads:
+            cells = self._met(vertex.path.events, others)
+            return cells, cells
+        words = self._words(self._steps, vertex.path.events, self._column(vertex, wo))
+        kinds = ([mi.UInt32(kind)] for kind in (_DIFFUSE, _GLOSSY))
+        diffuse, glossy = (self._met(_states(words, kind), others) for kind in kinds)
+        return diffuse, glossy
+
+    def in_medium(self, path: PathState, others: list[mi.UInt32]) -> list[mi.UInt32]:
+        """The cells of a path that is joined with light paths at a point of a medium, on the way
+        to its next vertex."""
+        states = path.events
+        if self._reads:
+            words = self._words(self._steps, states, mi.UInt32(_SCATTERS))
+            states = _states(words, [mi.UInt32(_DIFFUSE)])
+        return self._met(states, others)
+
+    def at_camera(self, others: list[mi.UInt32]) -> list[mi.UInt32]:
+        """The cells of light paths that reach the sensor in the states ``others``."""
+        return self._met([mi.UInt32(0)] * len(others), others)
+
+    # ---- Along a chain of smooth surfaces ----
+
+    def specular(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
+        """The event at a smooth surface in a chain."""
+        return self._of_surface(shape, transmits)
+
+    def at_end(
+        self,
+        vertex: Vertex,
+        wo: mi.Vector3f,
+        bsdf_value: mi.Spectrum,
+        chain: Sequence[tuple[mi.UInt32, mi.Bool]],
+        emitter: mi.EmitterPtr,
+        active: mi.Bool,
+    ) -> list[mi.UInt32]:
+        """The cells of a path that leaves ``vertex`` in the direction ``wo``, where the BSDF has
+        the value ``bsdf_value``, and is bent by smooth surfaces until it ends in ``emitter``.
+
+        Args:
+            chain: The event at each surface, and whether there is one.
+        """
+        states = vertex.path.events
+        if self._reads:
+            words = self._words(self._steps, states, self._column(vertex, wo))
+            divides = active & self._divides(words)
+            states = _states(words, self._chosen(vertex, wo, bsdf_value, divides))
+            for column, exists in chain:
+                behind = _states(
+                    self._words(self._steps, states, column), [mi.UInt32(_SPECULAR)]
+                )
+                states = [dr.select(exists, new, old) for new, old in zip(behind, states)]
+        return self._ended(states, _looked_up(self._light_class, emitter))
+
+    # ---- Lobes ----
+
+    def share(
+        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool
+    ) -> mi.UnpolarizedSpectrum | mi.Float:
+        """The share of diffuse lobes in the value ``whole`` of the BSDF, for each colour."""
+        if not self._mixes:
+            return dr.select(self._kind(vertex.bsdf) == _DIFFUSE, mi.Float(1), 0)
+        # Where light disperses, values are of the hero alone
+        whole = None if self._disperses else whole
+        weight = self._weight(vertex)
+        return diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, whole, weight, active)
+
+    def _chosen(
+        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool
+    ) -> list[mi.UInt32]:
+        """The kind of lobe that each colour of a path takes for a sampled direction."""
+        if not self._mixes:
+            return [self._kind(vertex.bsdf)]
+        number = _hashed(vertex.si.p, wo)
+        return [
+            dr.select(number < part, mi.UInt32(_DIFFUSE), _GLOSSY)
+            for part in self.share(vertex, wo, whole, active)
+        ]
+
+    def _kind(self, bsdf: mi.BSDFPtr) -> mi.UInt32:
+        """The kind of the smooth lobes of BSDFs that have only one."""
+        if not self._sees_lobes:
+            return mi.UInt32(_DIFFUSE)
+        is_glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+        return dr.select(is_glossy, mi.UInt32(_GLOSSY), _DIFFUSE)
+
+    def _weight(self, vertex: Vertex) -> mi.Float | None:
+        if self._undivided is None:
+            return None
+        index = dr.reinterpret_array(mi.UInt32, vertex.bsdf)
+        known = index < dr.width(self._undivided)
+        return dr.select(known, dr.gather(mi.Float, self._undivided, index, known), -1)
+
+    # ---- States ----
+
+    def _sampled(
+        self,
+        table: mi.UInt32,
+        vertex: Vertex,
+        bs: mi.BSDFSample3f,
+        wo: mi.Vector3f,
+        whole: mi.Spectrum | None,
+        active: mi.Bool,
+    ) -> list[mi.UInt32]:
+        """The states behind a vertex, for the lobe that ``bs`` is from."""
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        is_straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        column = dr.select(is_straight, mi.UInt32(_PASSES), self._column(vertex, wo))
+        words = self._words(table, vertex.path.events, column)
+        divides = active & ~is_delta & self._divides(words)
+        kinds = self._chosen(vertex, wo, whole, divides)
+        return _states(words, [dr.select(is_delta, mi.UInt32(_SPECULAR), k) for k in kinds])
+
+    def _column(self, vertex: Vertex, wo: mi.Vector3f) -> mi.UInt32:
+        """What happens at a vertex that scatters light between ``si.wi`` and ``wo``."""
+        si = vertex.si
+        transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
+        column = self._of_surface(si.shape, transmits)
+        if vertex.medium is not None:
+            column = dr.select(vertex.medium.scatters, mi.UInt32(_SCATTERS), column)
+        return column
+
+    def _of_surface(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
+        column = dr.select(transmits, mi.UInt32(_TRANSMITS), 0)
+        if self._surface_class is not None:
+            column += _COLUMNS * _looked_up(self._surface_class, shape)
+        return column
+
+    def _words(
+        self, table: mi.UInt32, states: list[mi.UInt32], column: mi.UInt32
+    ) -> list[mi.UInt32]:
+        """The next state for each kind of lobe, for each of the ``states``."""
+        return [dr.gather(mi.UInt32, table, s * self._columns + column) for s in states]
+
+    def _divides(self, words: list[mi.UInt32]) -> mi.Bool:
+        """Whether the next state depends on whether the lobe is diffuse."""
+        mask = (1 << _STATE_BITS) - 1
+        return any_of(((word ^ (word >> _STATE_BITS)) & mask) != 0 for word in words)
+
+    def _met(self, states: list[mi.UInt32], others: list[mi.UInt32]) -> list[mi.UInt32]:
+        """The cells of paths that are joined from two subpaths."""
+        return [
+            dr.gather(mi.UInt32, self._pairs, state * self._backs + other)
+            for state, other in zip(states, others)
+        ]
+
+    def _ended(self, states: list[mi.UInt32], light: mi.UInt32) -> list[mi.UInt32]:
+        """The cells of paths that end at a light."""
+        return [dr.gather(mi.UInt32, self._ends, s * self._lights + light) for s in states]
+
+
+def any_of(masks: Iterable[mi.Bool]) -> mi.Bool:
+    """Whether any of the masks is true."""
+    return functools.reduce(operator.or_, masks)
+
+
+def _states(words: list[mi.UInt32], kinds: list[mi.UInt32]) -> list[mi.UInt32]:
+    """The states in words, for the kind of lobe of each colour. All colours can share a kind."""
+    kinds = kinds * len(words) if len(kinds) < len(words) else kinds
+    mask = (1 << _STATE_BITS) - 1
+    return [(word >> (kind * _STATE_BITS)) & mask for word, kind in zip(words, kinds)]
+
+
+def _by_kind(steps: np.ndarray) -> np.ndarray:
+    """The table of an automaton, shape [states, symbols], as [states, columns, kinds]."""
+    steps = steps.reshape(len(steps), -1, PER_CLASS)
+    columns = [steps[..., side : side + _KINDS] for side in (0, _KINDS)]
+    columns += [steps[..., [symbol] * _KINDS] for symbol in (VOLUME, STRAIGHT)]
+    return np.stack(columns, axis=2).reshape(len(steps), -1, _KINDS)
+
+
+def _packed(parts: np.ndarray, bits: int) -> mi.UInt32:
+    """Words with one number of each of the ``parts``."""
+    words = np.zeros(parts.shape[1:], np.uint32)
+    for index, part in enumerate(parts):
+        words |= part.astype(np.uint32) << np.uint32(index * bits)
+    return from_numpy(mi.UInt32, words)
+
+
+def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:
+    """A vertex of a light path, as a camera path sees it that arrives from ``to_camera``."""
+    si = mi.SurfaceInteraction3f(vertex.si)
+    si.wi = to_camera
+    return Vertex(si, vertex.bsdf, vertex.path, None, vertex.medium)
+
+
+def _looked_up(table: mi.UInt32, pointer: Any) -> mi.UInt32:
+    """The entry of a table over Dr.Jit's indices of objects; 0 for objects that it does not
+    have."""
+    index = dr.reinterpret_array(mi.UInt32, pointer)
+    return dr.gather(mi.UInt32, table, index, index < dr.width(table))
+
+
+def _hashed(p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+    """A number in [0, 1) that looks random, and is a function of a position and a direction."""
+    word = mi.UInt32(0)
+    for number in (*p, *d):
+        word = (word ^ dr.reinterpret_array(mi.UInt32, number)) * 0x9E3779B1
+        word ^= word >> 15
+    word = (word ^ (word >> 13)) * 0x85EBCA6B
+    # 23 bits, so that the number stays below 1
+    return mi.Float((word ^ (word >> 16)) >> 9) * 2.0**-23
