@@ -16,8 +16,24 @@ weight shows the failure. Code that uses the direction without the weight needs 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
+
+
+@dataclass
+class DiffuseLobes:
+    """The values of the diffuse lobes of a BSDF that has glossy ones too, cosine included. They are
+    not known where they are ``None``.
+
+    Attributes:
+        connected: In the direction of the connection of a vertex.
+        sampled: In the sampled direction.
+    """
+
+    connected: mi.Spectrum | None = None
+    sampled: mi.Spectrum | None = None
 
 
 def eval_bsdf(
@@ -67,9 +83,16 @@ def eval_and_sample_bsdf(
     wo: mi.Vector3f,
     sample_1: mi.Float,
     sample_2: mi.Point2f,
+    lobes: DiffuseLobes | None = None,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """The results of :func:`eval_bsdf` and :func:`sample_bsdf`, in one call of the BSDF."""
-    value, density, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, sample_1, sample_2)
+    """The results of :func:`eval_bsdf` and :func:`sample_bsdf`, in one call of the BSDF, which sets
+    ``lobes`` as well."""
+    if lobes is None:
+        value, density, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, sample_1, sample_2)
+    else:
+        value, density, bs, weight, lobes.connected, lobes.sampled = dr.dispatch(
+            bsdf, _with_lobes(ctx), si, wo, sample_1, sample_2
+        )
     return _finite_value(value), _finite(density), *_finite_sample(bs, weight)
 
 
@@ -81,6 +104,7 @@ def diffuse_share(
     whole: mi.Spectrum | None,
     undivided: mi.Float | None,
     active: mi.Bool | bool = True,
+    known: mi.Spectrum | None = None,
 ) -> mi.UnpolarizedSpectrum:
     """The share of diffuse lobes in the BSDF's value, without delta lobes, for each colour. It
     depends on nothing but the vertex and the two directions. A BSDF with lobes of one kind is not
@@ -95,18 +119,19 @@ def diffuse_share(
             density of a sample; ``None`` if it is not known.
         undivided: The weight of the diffuse lobes where the BSDF is one of these two, or contains
             one of them, elsewhere negative; ``None`` if it is negative everywhere.
+        known: The value of the diffuse lobes (:class:`DiffuseLobes`), if it is known.
     """
-    flags, diffuse = bsdf.flags(), int(mi.BSDFFlags.Diffuse)
+    flags = bsdf.flags()
     is_diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
     mixes = is_diffuse & mi.has_flag(flags, mi.BSDFFlags.Glossy)
     active = active & mixes
     if whole is None:
         whole = _finite_value(bsdf.eval(ctx, si, wo, active))
     whole = mi.unpolarized_spectrum(whole)
-    parts = mi.BSDFContext(ctx.mode, ctx.type_mask, ctx.component)
-    parts.type_mask = ctx.type_mask & ~(int(mi.BSDFFlags.All) & ~diffuse)
-    divides = active if undivided is None else active & (undivided < 0)
-    one = mi.unpolarized_spectrum(_finite_value(bsdf.eval(parts, si, wo, divides)))
+    if known is None:
+        divides = active if undivided is None else active & (undivided < 0)
+        known = bsdf.eval(_diffuse_part(ctx), si, wo, divides)
+    one = mi.unpolarized_spectrum(_finite_value(known))
     if undivided is not None:
         albedo = mi.unpolarized_spectrum(
             bsdf.eval_diffuse_reflectance(si, active & (undivided >= 0))
@@ -115,6 +140,28 @@ def diffuse_share(
         one = dr.select(undivided < 0, one, lambertian)
     share = dr.select(whole > 0, dr.clip(one / whole, 0, 1), 0)
     return dr.select(mixes, share, dr.select(is_diffuse, mi.Float(1), 0))
+
+
+def _with_lobes(ctx: mi.BSDFContext):
+    """The function that a BSDF is asked to execute for :func:`eval_and_sample_bsdf` with lobes."""
+    parts = _diffuse_part(ctx)
+
+    def call(bsdf, si, wo, sample_1, sample_2):
+        value, density, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, sample_1, sample_2)
+        connected, sampled = dr.zeros(mi.Spectrum), dr.zeros(mi.Spectrum)
+        flags = bsdf.flags()
+        if mi.has_flag(flags, mi.BSDFFlags.Diffuse) and mi.has_flag(flags, mi.BSDFFlags.Glossy):
+            connected, sampled = (bsdf.eval(parts, si, d) for d in (wo, bs.wo))
+        return value, density, bs, weight, connected, sampled
+
+    return call
+
+
+def _diffuse_part(ctx: mi.BSDFContext) -> mi.BSDFContext:
+    """A context for the diffuse lobes alone."""
+    parts = mi.BSDFContext(ctx.mode, ctx.type_mask, ctx.component)
+    parts.type_mask = ctx.type_mask & ~(int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse))
+    return parts
 
 
 def _finite(number: mi.Float) -> mi.Float:

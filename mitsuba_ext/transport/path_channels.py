@@ -68,7 +68,8 @@ class PathChannels(PathEvents):
         and the path gains ``value``."""
         wo = vertex.si.to_local(ds.d)
         cells = self.at_connection(vertex, wo, ds.emitter)
-        self._divide(vertex, wo, bsdf_value, *cells, value, active)
+        known = vertex.lobes and vertex.lobes.connected
+        self._divide(vertex, wo, bsdf_value, *cells, value, active, known)
 
     def joined(
         self,
@@ -100,12 +101,13 @@ class PathChannels(PathEvents):
         glossy: list[mi.UInt32],
         value: mi.Spectrum,
         active: mi.Bool,
+        known: mi.Spectrum | None = None,
     ) -> None:
         """Divides the ``value`` of a connection among the cells for diffuse and glossy lobes, whose
         values add up to ``whole``."""
         # Where both belong to the same channels, no lobe is evaluated
         divides = active & any_of(one != other for one, other in zip(diffuse, glossy))
-        share = self.share(vertex, wo, whole, divides)
+        share = self.share(vertex, wo, whole, divides, known)
         if self.colours == 1:
             is_diffuse = share > 0
             cells = [dr.select(is_diffuse, one, other) for one, other in zip(diffuse, glossy)]

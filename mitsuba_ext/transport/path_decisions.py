@@ -67,6 +67,8 @@ class Scattering:
         """Samples a direction, and evaluates the BSDF in another one.
 
         Parameters:
+            vertex: The vertex. ``vertex.lobes`` are set, if they are wanted and the BSDF alone
+                chooses the direction.
             wo: The other direction (local, towards the light of a connection).
             sample_1, sample_2: Uniform numbers.
 
@@ -75,7 +77,10 @@ class Scattering:
             samples ``wo``; the sampled direction, with its density; value / density of the sampled
             direction; the new state.
         """
-        return *eval_and_sample_bsdf(vertex.bsdf, ctx, vertex.si, wo, sample_1, sample_2), state
+        found = eval_and_sample_bsdf(
+            vertex.bsdf, ctx, vertex.si, wo, sample_1, sample_2, vertex.lobes
+        )
+        return *found, state
 
     def eval_pdf(
         self, state: Any, ctx: mi.BSDFContext, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool

@@ -42,7 +42,7 @@ from ..scene.expressions.alphabet import PER_CLASS, STRAIGHT, VOLUME, Alphabet
 from ..scene.expressions.automaton import MOST_STATES, Automaton
 from ..scene.expressions.notation import Expression
 from ..util.arrays import from_numpy
-from .bsdfs import diffuse_share
+from .bsdfs import DiffuseLobes, diffuse_share
 from .heroes import Heroes
 from .vertex import MediumVertex, PathState, Vertex
 
@@ -78,10 +78,16 @@ class PathEvents:
     def __init__(self, scene: mi.Scene, expressions: Sequence[Expression]) -> None:
         alphabet = Alphabet.of(scene, expressions)
         automaton = Automaton.of(expressions, alphabet.vertices, alphabet.lights)
-        self._light_class, self._surface_class = alphabet.light_class, alphabet.surface_class
+        self._surface_class = alphabet.surface_class
         self.cells = automaton.cells
         steps, back = (_by_kind(table) for table in (automaton.next, automaton.back))
-        self._columns, self._lights = steps.shape[1], len(alphabet.lights)
+        # Lights that no expression tells apart are one
+        ends = np.concatenate([automaton.ends, automaton.begins[None]])
+        ends, light_class = np.unique(ends, axis=1, return_inverse=True)
+        ends, begins = ends[:-1], ends[-1]
+        light_class = light_class.reshape(-1)[alphabet.light_class.numpy()]
+        self._light_class = from_numpy(mi.UInt32, light_class) if light_class.any() else None
+        self._columns, self._lights = steps.shape[1], ends.shape[1]
         self._steps, self._back = (
             _packed(np.moveaxis(table, 2, 0), _STATE_BITS) for table in (steps, back)
         )
@@ -90,10 +96,9 @@ class PathEvents:
                 "the light path expressions need too large a table: render fewer expressions at "
                 "once, or name fewer lights and surfaces in them"
             )
-        lit = automaton.ends[steps[..., :_SPECULAR]]
+        lit = ends[steps[..., :_SPECULAR]]
         self._lit = _packed(np.moveaxis(lit, 2, 0), _CELL_BITS)
-        self._ends = from_numpy(mi.UInt32, automaton.ends)
-        self._begins = from_numpy(mi.UInt32, automaton.begins)
+        self._ends, self._begins = (from_numpy(mi.UInt32, table) for table in (ends, begins))
         self._pairs, self._backs = from_numpy(mi.UInt32, automaton.pairs), len(back)
         self._reads = len(steps) > 1
         self._sees_lobes = any(
@@ -122,7 +127,8 @@ class PathEvents:
         is the BSDF's value in this direction / density."""
         if not self._reads:
             return vertex.path.events
-        return self._sampled(self._steps, vertex, bs, bs.wo, weight * bs.pdf, active)
+        known = vertex.lobes and vertex.lobes.sampled
+        return self._sampled(self._steps, vertex, bs, bs.wo, weight * bs.pdf, active, known)
 
     def at_light(self, path: PathState, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
         """The cells of a path that hits a light."""
@@ -240,27 +246,35 @@ class PathEvents:
 
     # ---- Lobes ----
 
+    def lobes(self) -> DiffuseLobes | None:
+        """The values of diffuse lobes that a vertex wants to know, which are not known yet."""
+        is_wanted = self._mixes and self._undivided is None and not self._disperses
+        return DiffuseLobes() if is_wanted else None
+
     def share(
-        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool
-    ) -> mi.UnpolarizedSpectrum | mi.Float:
-        """The share of diffuse lobes in the value ``whole`` of the BSDF, for each colour."""
+        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool,
+        known: mi.Spectrum | None = None,
+    ) -> mi.UnpolarizedSpectrum | mi.Float:  # fmt: skip
+        """The share of diffuse lobes in the value ``whole`` of the BSDF, for each colour. ``known``
+        is the value of these lobes, if it is known."""
         if not self._mixes:
             return dr.select(self._kind(vertex.bsdf) == _DIFFUSE, mi.Float(1), 0)
         # Where light disperses, values are of the hero alone
         whole = None if self._disperses else whole
         weight = self._weight(vertex)
-        return diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, whole, weight, active)
+        return diffuse_share(vertex.bsdf, self._ctx, vertex.si, wo, whole, weight, active, known)
 
     def _chosen(
-        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool
-    ) -> list[mi.UInt32]:
+        self, vertex: Vertex, wo: mi.Vector3f, whole: mi.Spectrum | None, active: mi.Bool,
+        known: mi.Spectrum | None = None,
+    ) -> list[mi.UInt32]:  # fmt: skip
         """The kind of lobe that each colour of a path takes for a sampled direction."""
         if not self._mixes:
             return [self._kind(vertex.bsdf)]
         number = _hashed(vertex.si.p, wo)
         return [
             dr.select(number < part, mi.UInt32(_DIFFUSE), _GLOSSY)
-            for part in self.share(vertex, wo, whole, active)
+            for part in self.share(vertex, wo, whole, active, known)
         ]
 
     def _kind(self, bsdf: mi.BSDFPtr) -> mi.UInt32:
@@ -287,6 +301,7 @@ class PathEvents:
         wo: mi.Vector3f,
         whole: mi.Spectrum | None,
         active: mi.Bool,
+        known: mi.Spectrum | None = None,
     ) -> list[mi.UInt32]:
         """The states behind a vertex, for the lobe that ``bs`` is from."""
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -294,7 +309,7 @@ class PathEvents:
         column = dr.select(is_straight, mi.UInt32(_PASSES), self._column(vertex, wo))
         words = self._words(table, vertex.path.events, column)
         divides = active & ~is_delta & self._divides(words)
-        kinds = self._chosen(vertex, wo, whole, divides)
+        kinds = self._chosen(vertex, wo, whole, divides, known)
         return _states(words, [dr.select(is_delta, mi.UInt32(_SPECULAR), k) for k in kinds])
 
     def _column(self, vertex: Vertex, wo: mi.Vector3f) -> mi.UInt32:
@@ -308,9 +323,7 @@ class PathEvents:
 
     def _of_surface(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
         column = dr.select(transmits, mi.UInt32(_TRANSMITS), 0)
-        if self._surface_class is not None:
-            column += _COLUMNS * _looked_up(self._surface_class, shape)
-        return column
+        return column + _COLUMNS * _looked_up(self._surface_class, shape)
 
     def _words(
         self, table: mi.UInt32, states: list[mi.UInt32], column: mi.UInt32
@@ -370,9 +383,11 @@ def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:
     return Vertex(si, vertex.bsdf, vertex.path, None, vertex.medium)
 
 
-def _looked_up(table: mi.UInt32, pointer: Any) -> mi.UInt32:
+def _looked_up(table: mi.UInt32 | None, pointer: Any) -> mi.UInt32:
     """The entry of a table over Dr.Jit's indices of objects; 0 for objects that it does not
-    have."""
+    have, and without a table."""
+    if table is None:
+        return mi.UInt32(0)
     index = dr.reinterpret_array(mi.UInt32, pointer)
     return dr.gather(mi.UInt32, table, index, index < dr.width(table))
 

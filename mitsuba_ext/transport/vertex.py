@@ -97,6 +97,8 @@ class Vertex:
         path: The state of the path that has reached the vertex.
         pixel: Index, row by row, of the film pixel in which the path begins; ``None`` if unknown.
         medium: The part that concerns media; ``None`` if the scene has none.
+        lobes: The values of the diffuse lobes of the BSDF (:class:`.bsdfs.DiffuseLobes`), for light
+            path expressions; ``None`` if they are not wanted.
     """
 
     si: mi.SurfaceInteraction3f
@@ -104,6 +106,7 @@ class Vertex:
     path: PathState
     pixel: mi.UInt32 | None = None
     medium: MediumVertex | None = None
+    lobes: Any = None
 
     @property
     def depth(self) -> mi.UInt32:

@@ -212,7 +212,9 @@ class Walk:
                     self.replay.emitted(si, path, mis, hit.emitter, seen)
 
             # ----- Should we continue tracing to reach one more vertex? -----
-            vertex = Vertex(si, si.bsdf(ray), path, pixel, in_medium)
+            vertex = Vertex(
+                si, si.bsdf(ray), path, pixel, in_medium, self.channels and self.channels.lobes()
+            )
             active_next, active_em = media.goes_on(vertex, self.max_depth, active)
 
             # ----- Which points of which lights do we connect to? -----
