@@ -54,6 +54,12 @@ def opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
     return from_numpy(mi.Bool, table)
 
 
+def has_glossy_lobes(scene: mi.Scene) -> bool:
+    """Whether a BSDF of the scene has glossy lobes."""
+    glossy = int(mi.BSDFFlags.Glossy)
+    return any(int(bsdf.flags()) & glossy for bsdf in _bsdfs(scene))
+
+
 def mixes_lobes(scene: mi.Scene) -> bool:
     """Whether a BSDF of the scene has both diffuse and glossy lobes."""
     diffuse, glossy = int(mi.BSDFFlags.Diffuse), int(mi.BSDFFlags.Glossy)

@@ -37,7 +37,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..scene.bsdfs import mixes_lobes, undivided_bsdfs
+from ..scene.bsdfs import has_glossy_lobes, mixes_lobes, undivided_bsdfs
 from ..scene.expressions.alphabet import PER_CLASS, STRAIGHT, VOLUME, Alphabet
 from ..scene.expressions.automaton import MOST_STATES, Automaton
 from ..scene.expressions.notation import Expression
@@ -101,7 +101,7 @@ class PathEvents:
         self._ends, self._begins = (from_numpy(mi.UInt32, table) for table in (ends, begins))
         self._pairs, self._backs = from_numpy(mi.UInt32, automaton.pairs), len(back)
         self._reads = len(steps) > 1
-        self._sees_lobes = any(
+        self._sees_lobes = has_glossy_lobes(scene) and any(
             bool((table[..., _DIFFUSE] != table[..., _GLOSSY]).any()) for table in (steps, back)
         )
         self._mixes = self._sees_lobes and mixes_lobes(scene)
@@ -395,9 +395,10 @@ def _looked_up(table: mi.UInt32 | None, pointer: Any) -> mi.UInt32:
 def _hashed(p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
     """A number in [0, 1) that looks random, and is a function of a position and a direction."""
     word = mi.UInt32(0)
-    for number in (*p, *d):
-        word = (word ^ dr.reinterpret_array(mi.UInt32, number)) * 0x9E3779B1
-        word ^= word >> 15
+    for index, number in enumerate((*p, *d)):
+        bits = dr.reinterpret_array(mi.UInt32, number)
+        word += bits * ((0x9E3779B1 * (2 * index + 1)) & 0xFFFFFFFF)
+    word = (word ^ (word >> 15)) * 0x2C1B3C6D
     word = (word ^ (word >> 13)) * 0x85EBCA6B
     # 23 bits, so that the number stays below 1
     return mi.Float((word ^ (word >> 16)) >> 9) * 2.0**-23
