@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import mitsuba as mi
 
+from mitsuba_ext.bases.learned_state import check_target, file_of
 from mitsuba_ext.bases.slots import read_slot
 from mitsuba_ext.bases.staged_integrator import NO_LIMIT
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
@@ -225,11 +226,13 @@ class IrradianceCache(WalkIntegrator):
         return rounds.final_grid()
 
     def _file(self, scene: mi.Scene) -> LearnedFile | None:
-        if self.cache_file:
-            self.check_target("cache_file", self.cache_file)
+        if not self.cache_file:
+            return None
+        check_target(self.name, "cache_file", self.cache_file)
         shown = {**self.common_parameters(), **self.parameters()}
         made_by = ", ".join(f"{key} = {shown[key]}" for key in _OF_RECORDS)
-        return self.file_of("cache_file", scene, f"{made_by} ({mi.variant()})")
+        made_by += f" ({mi.variant()})"
+        return file_of(self.name, "cache_file", self.cache_file, scene, made_by)
 
     def _known(self, file: LearnedFile | None) -> Records:
         """The records of earlier renders."""

@@ -38,6 +38,7 @@ from ..transport.decisions import Decisions
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
 from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
+from .learned_state import check_target
 from .slots import BIDIRECTIONAL_SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
 
@@ -155,7 +156,7 @@ class LightPathIntegrator(WalkIntegrator):
     def render_once(self, request):
         if self.technique_images:
             check = image_files.check_exr_target
-            self.check_target("technique_images", self.technique_images, check)
+            check_target(self.name, "technique_images", self.technique_images, check)
         return super().render_once(request)
 
 

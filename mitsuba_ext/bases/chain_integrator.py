@@ -31,6 +31,7 @@ from ..transport.frozen import with_recordings
 from ..transport.path_program import PathProgram
 from ..transport.walk import Walk
 from ..util.parameters import MOST_SPP
+from .learned_state import check_target, file_of
 from .walk_integrator import WalkIntegrator
 
 #: The largest share of the time limit for camera samples.
@@ -126,7 +127,7 @@ class ChainIntegrator(WalkIntegrator):
         """
         if not self.chain_file:
             return None
-        self.check_target("chain_file", self.chain_file)
+        check_target(self.name, "chain_file", self.chain_file)
         sensor, film = target.sensor, target.sensor.film()
         made_by = {
             **self.parameters(), "chain_file": "", "max_depth": self.max_depth,
@@ -135,7 +136,8 @@ class ChainIntegrator(WalkIntegrator):
             "filter": film.rfilter(), "sensor": sensor_digest(sensor),
         }  # fmt: skip
         described = (f"{key} = {' '.join(str(value).split())}" for key, value in made_by.items())
-        return self.file_of("chain_file", target.scene, ", ".join(described))
+        made_by = ", ".join(described)
+        return file_of(self.name, "chain_file", self.chain_file, target.scene, made_by)
 
     def target(self, setting: Setting) -> ImageTarget | PathTarget | None:
         """The target distribution of the chains; ``None`` if no path is left for them to find."""

@@ -5,20 +5,17 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
 
-from ..planning import kept_learning, learned_file
+from ..planning import kept_learning
 from ..planning.costs import LEARNING_KERNELS
-from ..planning.learned_file import LearnedFile
 from ..planning.learner import Learner
 from ..planning.pilots import pilot_samples, stage_weights
-from ..planning.planner import Estimators, LearningPlan, Planner, Saver
+from ..planning.planner import Estimators, LearningPlan, Planner
 from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
 from ..rendering.device import SampleBytes
@@ -34,9 +31,8 @@ from ..transport.path_channels import PathChannels
 from ..transport.path_decisions import SceneQuery
 from ..transport.queries.scene import scene_query
 from ..transport.walk import Walk
-from ..util.errors import InputError
-from ..util.stored_arrays import StoredArrays
 from .clamps import bias_by, clamped, read_clamps, refuse_expressions
+from .learned_state import LearnedState
 from .output_variables import OutputVariables
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
@@ -87,6 +83,7 @@ class WalkIntegrator(StagedIntegrator):
         light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
         no_expressions (str): Why it cannot render light path expressions; empty if it can. The text
             ends a sentence in an error message.
+        learned (LearnedState): Where it keeps what it learns.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
         outputs (OutputVariables): The channels of the parameter ``aovs``.
@@ -108,8 +105,7 @@ class WalkIntegrator(StagedIntegrator):
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
-        self.save_learned = self.load_learned = ""
-        self.keep_learned = False
+        self.learned = LearnedState(self.name)
 
     # ---- What a subclass calls ----
 
@@ -141,46 +137,14 @@ class WalkIntegrator(StagedIntegrator):
         if wishes:
             read = self.reader(props)
             self._pilot_spp = read("pilot_spp", max(wishes), minimum=0)
-            self.save_learned = read("save_learned", "")
-            self.load_learned = read("load_learned", "")
-            self.keep_learned = read("keep_learned", False)
-            for key in ("save_learned", "keep_learned"):
-                if self.load_learned and getattr(self, key):
-                    raise ValueError(
-                        f'"{self.name}": with "load_learned" nothing is learned: leave "{key}" out'
-                    )
-
-    def file_of(
-        self, key: str, scene: mi.Scene, made_by: str, requested: str = ""
-    ) -> LearnedFile | None:
-        """The file that a request names, or else the parameter ``key``; ``None`` if neither does.
-        ``made_by`` is explained in :class:`LearnedFile`."""
-        if not (file := requested or getattr(self, key)):
-            return None
-        return LearnedFile(Path(file), scene, made_by, f'"{self.name}": the parameter "{key}"')
+            self.learned = LearnedState.read(self.name, read)
 
     def parameters(self) -> dict[str, Any]:
-        learning = {
-            "pilot_spp": self._pilot_spp,
-            "save_learned": self.save_learned,
-            "load_learned": self.load_learned,
-            "keep_learned": self.keep_learned or "",
-        }
-        given = {key: value for key, value in learning.items() if value not in (None, "")}
-        return {**super().parameters(), **self._described_slots(), **given}
-
-    def check_target(
-        self, key: str, file: str, check: Callable[[Path], None] = learned_file.check_target
-    ) -> None:
-        """
-        Raises:
-            ValueError: The file that the parameter ``key`` names cannot be written, or ``check``
-                finds that there is one of another kind.
-        """
-        try:
-            check(Path(file))
-        except InputError as error:
-            raise ValueError(f'"{self.name}": "{key}": {error}') from None
+        pilots = {} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp}
+        return {
+            **super().parameters(), **self._described_slots(), **pilots,
+            **self.learned.parameters(),
+        }  # fmt: skip
 
     # ---- What the render calls ----
 
@@ -193,15 +157,15 @@ class WalkIntegrator(StagedIntegrator):
         self, request: Request, spp: int, kernels: float = math.inf
     ) -> LearningPlan:
         scene, sensor = request.scene, request.sensor
-        if target := self.target_of(request):
-            self.check_target("save_learned", target)
-        if request.load_learned or self.load_learned:
-            return LearningPlan(restore=functools.partial(self._loaded, request))
+        self.learned.check_target(request)
+        if self.learned.loads(request):
+            made_by = self._learned_by(sensor)
+            return LearningPlan(restore=lambda: self.learned.loaded(request, made_by))
         if self.max_depth < 2:
             return LearningPlan()
         pixel_count = math.prod(film_extent(sensor.film()))
         pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
-        if self.keep_learned:
+        if self.learned.keep:
             kept = kept_learning.find(scene, self._learned_by(sensor))
             if kept is not None and sum(pilots) <= kept.pilot_spp:
                 return LearningPlan(restore=kept.arrays)
@@ -268,6 +232,7 @@ class WalkIntegrator(StagedIntegrator):
     ) -> Planner:  # fmt: skip
         """The planner of a render. ``estimators`` makes the estimators of stages."""
         *pilots, _rest = samples
+        made_by = self._learned_by(request.sensor)
         # A restored state needs no pilots, but learners to restore it: these need a pilot_spp > 0
         pilot_spp = sum(pilots) if learning.restore is None else self._pilot_spp or 1
         setting = Setting(
@@ -277,14 +242,10 @@ class WalkIntegrator(StagedIntegrator):
         planner = Planner(
             self.slots, setting, samples, estimators,
             Decisions(query=self.query(request.scene)), learning,
-            self._savers(request, sum(pilots)),
+            self.learned.savers(request, made_by, sum(pilots)),
         )  # fmt: skip
         self.learners = planner.learners
         return planner
-
-    def target_of(self, request: Request) -> str:
-        """The file in which a render saves what it learns; empty for none."""
-        return request.save_learned or self.save_learned
 
     def _learned_by(self, sensor: mi.Sensor) -> str:
         """On what, besides the scene, learned states depend."""
@@ -295,25 +256,6 @@ class WalkIntegrator(StagedIntegrator):
         # The tables of some decisions have an entry for each pixel
         width, height = film_extent(sensor.film())
         return ", ".join([*slots, *depths, f"film = {width}x{height}"])
-
-    def _loaded(self, request: Request) -> dict[str, StoredArrays]:
-        made_by = self._learned_by(request.sensor)
-        file = self.file_of("load_learned", request.scene, made_by, request.load_learned)
-        if (stored := file.load()) is None:
-            raise FileNotFoundError(
-                f'{file.where} names "{file.path}", which does not exist: give it a file that '
-                f'"save_learned" wrote'
-            )
-        return stored.parts()
-
-    def _savers(self, request: Request, pilot_spp: int) -> list[Saver]:
-        """The functions that save what is learned, in a file and for this process."""
-        scene, made_by, savers = request.scene, self._learned_by(request.sensor), []
-        if file := self.file_of("save_learned", scene, made_by, request.save_learned):
-            savers.append(file.save)
-        if self.keep_learned and pilot_spp:
-            savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
-        return savers
 
     def estimators(self, request: Request, spp: int, learning: LearningPlan) -> Estimators:
         """The function that makes the estimators of the stages of a render with ``spp`` samples per

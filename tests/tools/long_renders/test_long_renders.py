@@ -280,6 +280,6 @@ def test_an_interrupted_batch_leaves_no_learned_state(scenes, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         renderer.render(Batch(0, 0, 64))
     integrator = renderer.chosen.named.integrator
-    assert not integrator.save_learned and not integrator.load_learned
+    assert not integrator.learned.has_file
     monkeypatch.undo()
     assert renderer.render(Batch(0, 0, 64)).learned
