@@ -174,7 +174,7 @@ class Auto(LightPathIntegrator):
         pixel_count = math.prod(film_extent(film))
         least = self._least_samples()
         is_short = pixel_count * spp < least
-        is_short &= not (self.learned.target(request) or self.learned.keep)
+        is_short &= not (self.learned_state.target(request) or self.learned_state.keep)
         plan = super().plan_learning(request, 0 if is_short else spp, kernels)
         if is_short and plan.restore is None:
             remark = f"nothing: there are fewer than {least} samples"

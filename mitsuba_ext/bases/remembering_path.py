@@ -61,8 +61,12 @@ class RememberingPath(WalkIntegrator):
                     f'"{self.name}": there are no gradients with the "{self.slots[slot].name}" of '
                     f'the parameter "{slot}": choose another one'
                 )
-        for key in ("aovs", "checkpoint", "keep_learned"):
-            if getattr(self, key):
+        has = {
+            "aovs": self.aovs, "checkpoint": self.checkpoint,
+            "keep_learned": self.learned_state.keep,
+        }  # fmt: skip
+        for key, value in has.items():
+            if value:
                 raise ValueError(f'"{self.name}" has no parameter "{key}": leave it out')
         self.learn_every = 0
         if self.can_learn:

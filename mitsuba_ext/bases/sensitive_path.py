@@ -34,7 +34,7 @@ class SensitivePath(RememberingPath):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.learned.save = ""
+        self.learned_state.save = ""
         self._requested: tuple[SceneMark, frozenset[str]] | None = None
         self._optimized: Optimized | None = None
 
@@ -46,7 +46,7 @@ class SensitivePath(RememberingPath):
         Parameters:
             scene, params, sensor, seed, spp: Those of a pass for gradients.
         """
-        if not self.can_learn or self.learned.load:
+        if not self.can_learn or self.learned_state.load:
             return False
         items = params.items() if hasattr(params, "items") else ()
         keys = frozenset(str(key) for key, x in items if dr.grad_enabled(x))

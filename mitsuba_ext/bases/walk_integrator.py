@@ -83,7 +83,7 @@ class WalkIntegrator(StagedIntegrator):
         light_paths_see_media (bool): Whether its light paths, if it has any, scatter in them.
         no_expressions (str): Why it cannot render light path expressions; empty if it can. The text
             ends a sentence in an error message.
-        learned (LearnedState): Where it keeps what it learns.
+        learned_state (LearnedState): Where it keeps what it learns.
         slots (dict[str, Technique]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
         outputs (OutputVariables): The channels of the parameter ``aovs``.
@@ -105,7 +105,7 @@ class WalkIntegrator(StagedIntegrator):
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
-        self.learned = LearnedState(self.name)
+        self.learned_state = LearnedState(self.name)
 
     # ---- What a subclass calls ----
 
@@ -137,13 +137,13 @@ class WalkIntegrator(StagedIntegrator):
         if wishes:
             read = self.reader(props)
             self._pilot_spp = read("pilot_spp", max(wishes), minimum=0)
-            self.learned = LearnedState.read(self.name, read)
+            self.learned_state = LearnedState.read(self.name, read)
 
     def parameters(self) -> dict[str, Any]:
         pilots = {} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp}
         return {
             **super().parameters(), **self._described_slots(), **pilots,
-            **self.learned.parameters(),
+            **self.learned_state.parameters(),
         }  # fmt: skip
 
     # ---- What the render calls ----
@@ -157,15 +157,15 @@ class WalkIntegrator(StagedIntegrator):
         self, request: Request, spp: int, kernels: float = math.inf
     ) -> LearningPlan:
         scene, sensor = request.scene, request.sensor
-        self.learned.check_target(request)
-        if self.learned.loads(request):
+        self.learned_state.check_target(request)
+        if self.learned_state.loads(request):
             made_by = self._learned_by(sensor)
-            return LearningPlan(restore=lambda: self.learned.loaded(request, made_by))
+            return LearningPlan(restore=lambda: self.learned_state.loaded(request, made_by))
         if self.max_depth < 2:
             return LearningPlan()
         pixel_count = math.prod(film_extent(sensor.film()))
         pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
-        if self.learned.keep:
+        if self.learned_state.keep:
             kept = kept_learning.find(scene, self._learned_by(sensor))
             if kept is not None and sum(pilots) <= kept.pilot_spp:
                 return LearningPlan(restore=kept.arrays)
@@ -242,7 +242,7 @@ class WalkIntegrator(StagedIntegrator):
         planner = Planner(
             self.slots, setting, samples, estimators,
             Decisions(query=self.query(request.scene)), learning,
-            self.learned.savers(request, made_by, sum(pilots)),
+            self.learned_state.savers(request, made_by, sum(pilots)),
         )  # fmt: skip
         self.learners = planner.learners
         return planner

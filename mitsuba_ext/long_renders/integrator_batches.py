@@ -64,7 +64,7 @@ class IntegratorBatches:
         # An integrator with save_learned or load_learned uses this file for all batches
         self.learns = bool(
             getattr(integrator, "can_learn", False)
-            and not integrator.learned.has_file
+            and not integrator.learned_state.has_file
         )
 
     def length(self, spp: int, teaches: bool) -> int:

@@ -280,6 +280,6 @@ def test_an_interrupted_batch_leaves_no_learned_state(scenes, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         renderer.render(Batch(0, 0, 64))
     integrator = renderer.chosen.named.integrator
-    assert not integrator.learned.has_file
+    assert not integrator.learned_state.has_file
     monkeypatch.undo()
     assert renderer.render(Batch(0, 0, 64)).learned

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.transport.bsdfs import (
+    DiffuseLobes,
     bsdf_density,
     diffuse_share,
     eval_and_sample_bsdf,
@@ -122,6 +123,14 @@ def test_the_diffuse_share_is_the_same_however_the_whole_value_is_known() -> Non
             diffuse_share(bsdf, ctx, si, bs.wo, whole, weight)
             for whole in (None, evaluated, value * bs.pdf)
         ]
+        if name != "principled":
+            # And with the diffuse lobes from the call that samples
+            lobes = DiffuseLobes()
+            eval_and_sample_bsdf(bsdf, ctx, si, bs.wo, *numbers, lobes)
+            shares += [
+                diffuse_share(bsdf, ctx, si, bs.wo, evaluated, weight, known=known)
+                for known in (lobes.connected, lobes.sampled)
+            ]
         dr.eval(shares, is_smooth)  # in one kernel
         shares = [np.array(share)[:, np.array(is_smooth)] for share in shares]
         assert 0.05 < shares[0].mean() < 0.95, name
