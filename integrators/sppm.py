@@ -113,9 +113,6 @@ class ProgressivePhotonMapping(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters.read(self, props)
-        self.radius_in_media = self.parameter(
-            props, "radius_in_media", 0.0, none="automatic", minimum=0.0
-        )
         self.light_paths = self.parameter(
             props, "light_paths", 1.0, minimum=1 / MOST_PATHS, maximum=MOST_PATHS
         )
@@ -139,7 +136,5 @@ class ProgressivePhotonMapping(WalkIntegrator):
             alone = Decisions(next_event=NoConnections(), query=self.query(scene))
             return OneStage(self.walk(alone))
         check_shared_rays(self.name, scene, self.light_paths)
-        mapper = photon_mapper(
-            self, request, self.merging, self.radius_in_media, self.light_paths
-        )
+        mapper = photon_mapper(self, request, self.merging, self.light_paths)
         return OneStage(mapper, CameraSamples(**shared_numbers(scene, request.seed)))

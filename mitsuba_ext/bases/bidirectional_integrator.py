@@ -21,17 +21,21 @@ from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_media import outside_of
 from ..estimators.light_paths.light_side import LightSide
 from ..estimators.light_paths.light_walk import LightWalk
+from ..estimators.light_paths.medium_programs import LightSumsInMedia
+from ..estimators.light_paths.medium_scattering import MediumTerms
 from ..estimators.light_paths.merging.merging_parameters import MergingParameters, shared_numbers
-from ..estimators.light_paths.merging.merging_radius import MergingRadius
+from ..estimators.light_paths.merging.merging_radius import MergingRadii
 from ..estimators.light_paths.partial_sums import PartialSums
 from ..estimators.light_paths.path_memory import bytes_of_both_paths
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
+from ..estimators.light_paths.scattering import SurfaceTerms
 from ..images import image_files
 from ..rendering.camera import film_extent
 from ..rendering.device import SampleBytes, device_of
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule
 from ..rendering.statistics import RenderStatistics
+from ..scene.media import may_have_grids
 from ..scene.movers import movers
 from ..startup.registry import variant_bound
 from ..transport.decisions import Decisions
@@ -99,31 +103,40 @@ class LightPathIntegrator(WalkIntegrator):
             self.techniques = TechniqueImages(
                 film, *film_extent(film), self.max_depth, device_of(mi.Float).pass_bytes
             )
-        radius = Once(functools.partial(self.merging_radius, request, side))
         outside = outside_of(self.name, self.query(scene), scene, request.sensor)
-        return LightPathEstimators(self, side, radius, self.techniques, outside)
+        radii = Once(functools.partial(self.merging_radii, request, side, outside))
+        return LightPathEstimators(self, side, radii, self.techniques, outside)
 
-    def merging_radius(
+    def merging_radii(
         self,
         request: Request,
         side: LightSide,
+        outside: mi.MediumPtr | None = None,
         next_event: EmitterSampling | None = None,
         splits: bool = False,
-    ) -> MergingRadius | None:
-        """Within what radius vertices of a render are merged; ``None`` if they are not. With the
-        ``next_event`` and ``splits`` of its sums, its light paths have the same kernel."""
+    ) -> MergingRadii | None:
+        """Within what radii vertices of a render are merged; ``None`` if they are not. With the
+        ``next_event`` and ``splits`` of its sums, its light paths have the same kernel. For
+        ``outside``, see :class:`LightWalk`."""
         if self.merging is None:
             return None
+        scene, in_media = request.scene, outside is not None
         sums = PartialSums(
             dr.opaque(mi.Float, 1), splits=splits, merging=dr.opaque(mi.Float, 1),
             light_paths=dr.opaque(mi.Float, 1),
             has_clear_curves=side.emission.has_clear_curves,
+            terms=MediumTerms(may_have_grids(scene)) if in_media else SurfaceTerms(),
+            merging_in_media=dr.opaque(mi.Float, 1) if in_media else None,
         )  # fmt: skip
+        next_event = next_event or EmitterSampling()
+        program = LightSums(sums, next_event)
+        if in_media:
+            program = LightSumsInMedia(sums, next_event, scene)
         light_walk = LightWalk(
-            side.emission, self.max_depth, self.rr_depth,
-            LightSums(sums, next_event or EmitterSampling()), query=self.query(request.scene),
-        )
-        return self.merging.radius_of(
+            side.emission, self.max_depth, self.rr_depth, program, query=self.query(scene),
+            outside=outside, connects=True,
+        )  # fmt: skip
+        return self.merging.radii_of(
             request.scene, request.sensor, light_walk, not self.merges_all,
             request.samples_before,
         )  # fmt: skip
@@ -133,7 +146,7 @@ class LightPathIntegrator(WalkIntegrator):
         planner = self.planner(request, samples, learning, estimators)
         scene = request.scene
         if isinstance(estimators, LightPathEstimators) and (mi.is_spectral or movers(scene)):
-            if estimators.radius():
+            if estimators.radii():
                 planner.decide(**shared_numbers(scene, request.seed))
         if not self.technique_images:
             return planner
@@ -167,14 +180,14 @@ class LightPathEstimators:
     Attributes:
         integrator: Has the parameters.
         side: The lights and the sensor.
-        radius: Within what radius vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
+        radii: Within what radii vertices are merged (:meth:`LightPathIntegrator.merging_radii`).
         images: Receives the contributions of all techniques; ``None`` if nothing does.
         outside: See :class:`LightWalk`.
     """
 
     integrator: LightPathIntegrator
     side: LightSide
-    radius: Callable[..., MergingRadius | None]
+    radii: Callable[..., MergingRadii | None]
     images: TechniqueImages | None = None
     outside: mi.MediumPtr | None = None
 
@@ -194,16 +207,16 @@ class LightPathEstimators:
         walk = integrator.walk(replace(decisions, next_event=next_event), observer)
         if not are_traced:
             return walk
-        radius = None
+        radii = None
         if techniques.merges:
             compares = choice.observer is not None and choice.observer.compares
-            radius = self.radius(walk.next_event, compares)
-        if radius is not None and choice.pixel_width > 1:
-            radius = radius.of_coarse_film(choice.pixel_width)
+            radii = self.radii(walk.next_event, compares)
+        if radii is not None and choice.pixel_width > 1:
+            radii = radii.of_coarse_film(choice.pixel_width)
         sample_bytes = bytes_of_both_paths(techniques.light_paths, integrator.max_depth)
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
-            decisions.subpath_selection or SubpathSelection(), choice.observer, radius=radius,
+            decisions.subpath_selection or SubpathSelection(), choice.observer, radii=radii,
             merges_all=integrator.merges_all, light_paths=techniques.light_paths,
             most_lanes=device_of(mi.Float).lanes(sample_bytes), outside=self.outside,
         )  # fmt: skip
@@ -213,11 +226,7 @@ class LightPathEstimators:
 class BidirectionalIntegrator(LightPathIntegrator):
     """A :class:`LightPathIntegrator` with the parameters of :class:`bdpt`."""
 
-    has_light_paths = True
-
-    @property
-    def light_paths_see_media(self) -> bool:
-        return self.merging is None
+    has_light_paths = light_paths_see_media = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -147,16 +147,20 @@ class BidirectionalProgram(PathProgram):
             by_light=False,
         )
         if self.sums.merging is not None:
-            ref = vertex.path.arrival.ref
-            d = si.p - ref.p
+            d = si.p - vertex.path.arrival.ref.p
             squared = dr.squared_norm(d)
-            before = self.sums.merging_before(
-                vertex.path.history, squared, dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared)
-            )
+            before = self._merging_before(vertex, d, squared)
             # The vertex before the first one is the sensor
             merges = si.is_valid() & is_delta & (vertex.depth > 0) & (squared > 0)
             sums.dVC += dr.select(merges, self.sums.ratio(cosine) * before, 0)
         return sums
+
+    def _merging_before(
+        self, vertex: Vertex, d: mi.Vector3f, squared_distance: mi.Float
+    ) -> mi.Float | float:
+        """:meth:`PartialSums.merging_before`; ``d`` leads here from the previous vertex."""
+        cosine = dr.abs(dr.dot(vertex.path.arrival.ref.n, d)) * dr.rsqrt(squared_distance)
+        return self.sums.merging_before(vertex.path.history, squared_distance, cosine)
 
     def _reverse_density(self, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """The density with which a light path that arrives from ``wo`` goes on along the path."""
@@ -167,26 +171,40 @@ class BidirectionalProgram(PathProgram):
 
 class StoredSums(StoredHistory):
     """Stores the partial sums: ``last`` and ``dVC``; if they are split, also ``by_camera``, and the
-    part of connections of ``by_kind``."""
+    part of connections of ``by_kind``; and ``merging`` if it differs between vertices."""
 
     @classmethod
     def of(cls, sums: PartialSums) -> StoredSums:
         """For the sums that ``sums`` computes."""
-        return cls(5 if sums.splits else 2, sums.selection is not None)
+        count = 5 if sums.splits else 2
+        count += sums.merging_in_media is not None
+        return cls(count, sums.selection is not None)
 
     def words(self, history: Sums) -> list[mi.Float]:
         words = [history.last, history.dVC]
-        if self.word_count > 2:
+        if self._splits:
             words += [*history.by_camera, history.by_kind.x]
+        if self._merges:
+            words.append(history.merging)
         return words
 
     def read(self, words, depth, region) -> Sums:
         sums = Sums(words[0], words[1], region=region)
-        if self.word_count > 2:
+        if self._splits:
             sums.by_camera = mi.Vector2f(words[2], words[3])
             sums.by_kind = mi.Vector2f(words[4], 0)
+        if self._merges:
+            sums.merging = words[-1]
         sums.is_caustic = (depth > 1) & (sums.dVCM == 0)
         return sums
+
+    @property
+    def _splits(self) -> bool:
+        return self.word_count >= 5
+
+    @property
+    def _merges(self) -> bool:
+        return self.word_count in (3, 6)
 
 
 class LightSums(LightProgram):

@@ -29,12 +29,15 @@ class SumsInMedia(Sums):
     Attributes:
         transmittance: The known transmittance of the current segment, so far.
         length: Its length so far; ``None`` for camera paths.
+        before: For camera paths whose vertices are merged: the density of merging at the vertex
+            before the last one; ``None`` between vertices.
         behind: At a surface that may let the path pass: the sums with which it then goes on;
             ``None`` between surfaces.
     """
 
     transmittance: mi.Float | None = None
     length: mi.Float | None = None
+    before: mi.Float | None = None
     behind: SumsInMedia | None = None
 
     @classmethod
@@ -49,8 +52,11 @@ class BidirectionalProgramInMedia(BidirectionalProgram):
     weighs_transmittance = connects_all = True
 
     def begin(self, ray) -> SumsInMedia:
-        one = dr.full(mi.Float, 1, dr.width(ray))
-        return SumsInMedia.of(super().begin(ray), transmittance=one)
+        lanes = dr.width(ray)
+        sums = SumsInMedia.of(super().begin(ray), transmittance=dr.full(mi.Float, 1, lanes))
+        if self.sums.merging_in_media is not None:
+            sums.merging = dr.zeros(mi.Float, lanes)
+        return sums
 
     def arrive(self, path, si, in_medium) -> SumsInMedia:
         passed = path.history.transmittance * in_medium.attenuation
@@ -59,12 +65,24 @@ class BidirectionalProgramInMedia(BidirectionalProgram):
         # The environment has no distance
         seen = path.history.dVCM / self.sums.ratio(for_weights(passed))
         sums.dVCM = dr.select(si.is_valid(), sums.dVCM, seen)
+        sums.merging = self.sums.merging_at(si, in_medium.mei.medium)
         behind = replace(path.history, transmittance=passed)
-        return SumsInMedia.of(sums, transmittance=passed, behind=behind)
+        before = path.history.merging
+        return SumsInMedia.of(sums, transmittance=passed, before=before, behind=behind)
 
     def leave(self, vertex, bs) -> SumsInMedia:
-        left = super().leave(vertex, bs)
-        return _left(left, vertex.path.history.behind, bs)
+        left, arrived = super().leave(vertex, bs), vertex.path.history
+        left.merging = arrived.merging
+        return _left(left, arrived.behind, bs)
+
+    def _merging_before(self, vertex, d, squared_distance):
+        ref, history = vertex.path.arrival.ref, vertex.path.history
+        on_surface = dr.squared_norm(ref.n) > 0
+        cosine = dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared_distance)
+        return self.sums.merging_before(
+            history, squared_distance / for_weights(history.transmittance),
+            dr.select(on_surface, cosine, 1), history.before,
+        )  # fmt: skip
 
 
 class LightSumsInMedia(LightSums):
@@ -106,6 +124,7 @@ class LightSumsInMedia(LightSums):
             later.by_camera,
             is_caustic=~is_first & (history.dVCM == 0) if self._sums.merging is not None else None,
             by_kind=later.by_kind,
+            merging=self._sums.merging_at(si, vertex.medium.mei.medium),
         )
         return SumsInMedia.of(sums, transmittance=passed, length=length, behind=behind)
 

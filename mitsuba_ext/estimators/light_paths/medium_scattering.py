@@ -27,7 +27,8 @@ from ...transport.media import eval_phase
 from ...transport.numbers import Numbers
 from ...transport.path_decisions import SceneQuery
 from ...transport.transmittance import transmittance
-from .scattering import SurfaceTerms
+from ...util.arrays import channel_mean
+from .scattering import SurfaceTerms, is_in_medium
 
 
 class MediumTerms(SurfaceTerms):
@@ -87,18 +88,40 @@ class MediumTerms(SurfaceTerms):
     def cosine(self, si, d):
         return dr.select(is_in_medium(si), 1, super().cosine(si, d))
 
+    def phase(self, si, medium, wi, wo, active) -> tuple[mi.Spectrum, mi.Float]:
+        """At a vertex in ``medium``: the phase function for light between the local directions, and
+        the density of ``wo``."""
+        value, pdf = eval_phase(_at(si, medium, si.to_world(wi)), si.to_world(wo), active)
+        return mi.Spectrum(value), pdf
+
+    def extinction(self, si, medium) -> mi.Float:
+        """At a vertex in ``medium``: the mean of the extinction over the colours, for light along
+        the z axis. (The extinction of microflakes depends on the direction. Weights contain the
+        same extinction for all techniques, from either side.) 0 on surfaces."""
+        active = is_in_medium(si)
+        mei = _at(si, medium, mi.Vector3f(0, 0, 1))
+        _, _, σ = medium.get_scattering_coefficients(mei, active)
+        return dr.select(active, channel_mean(mi.Spectrum(σ)), 0)
+
+    def scattering(self, si, medium, active) -> mi.Spectrum:
+        """The coefficient of scattering at a vertex in ``medium``, for light from ``si.wi``."""
+        mei = _at(si, medium, si.to_world(si.wi))
+        return mi.Spectrum(medium.get_scattering_coefficients(mei, active)[0])
+
     def _or_phase(self, si, medium, wi, wo, active, value, pdf) -> tuple[mi.Spectrum, mi.Float]:
-        """The phase function for light between the local directions, where the vertex lies in a
-        medium; elsewhere ``value`` and ``pdf``."""
+        """:meth:`phase` where the vertex lies in a medium; elsewhere ``value`` and ``pdf``."""
         in_medium = active & is_in_medium(si)
-        mei = dr.zeros(mi.MediumInteraction3f)
-        mei.p, mei.wi, mei.time, mei.wavelengths = si.p, si.to_world(wi), si.time, si.wavelengths
-        mei.sh_frame, mei.medium = mi.Frame3f(mei.wi), medium
-        phase, phase_pdf = eval_phase(mei, si.to_world(wo), in_medium)
-        phase = dr.select(in_medium, mi.Spectrum(phase), value)
+        phase, phase_pdf = self.phase(si, medium, wi, wo, in_medium)
+        phase = dr.select(in_medium, phase, value)
         return phase, dr.select(in_medium, phase_pdf, pdf)
 
 
-def is_in_medium(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a vertex lies in a medium, and not on a surface."""
-    return si.shape == None  # noqa: E711
+def _at(
+    si: mi.SurfaceInteraction3f, medium: mi.MediumPtr, wi: mi.Vector3f
+) -> mi.MediumInteraction3f:
+    """The interaction with ``medium`` at the vertex ``si``, for light from ``wi`` (in world
+    space)."""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.wi, mei.time, mei.wavelengths = si.p, wi, si.time, si.wavelengths
+    mei.sh_frame, mei.medium = mi.Frame3f(mei.wi), medium
+    return mei

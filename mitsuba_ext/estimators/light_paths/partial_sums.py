@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ...transport.path_decisions import SubpathSelection
 from .both_ends import from_both_ends
-from .scattering import SurfaceTerms
+from .scattering import SurfaceTerms, is_in_medium
 
 
 @dataclass
@@ -39,6 +39,8 @@ class Sums:
             ``None`` for camera paths, and if vertices are not merged.
         by_kind: The parts of dVC that belong to connections (s, t ≥ 2) and to the light image
             (t = 1; only for camera paths); ``None`` if :class:`PartialSums` does not compute it.
+        merging: The density of merging at the last vertex (:meth:`PartialSums.merging_at`);
+            ``None`` if it is the same at all vertices.
     """
 
     dVCM: mi.Float
@@ -48,6 +50,7 @@ class Sums:
     count: mi.Float | None = None
     is_caustic: mi.Bool | None = None
     by_kind: mi.Vector2f | None = None
+    merging: mi.Float | None = None
 
     @property
     def last(self) -> mi.Float:
@@ -84,6 +87,9 @@ class PartialSums:
         merging: The density of merging at a vertex, relative to the product of the densities with
             which both subpaths sample it: π r² · number of light paths, or a multiple of it.
             ``None`` if vertices are not merged.
+        merging_in_media: The same for vertices in participating media, divided by the extinction:
+            4/3 π r³ · number of light paths, or the same multiple; ``None`` if vertices are not
+            merged, or none lie in media.
         merges_all: Whether vertices are merged wherever their BSDF is smooth. If not, they are
             merged only where light arrives from a delta lobe.
         light_paths: Number of light paths for each camera path: the number of samples of the
@@ -103,6 +109,7 @@ class PartialSums:
         light_paths: mi.Float | float = 1.0,
         has_clear_curves: bool = False,
         terms: SurfaceTerms = SurfaceTerms(),  # noqa: B008  (never modified)
+        merging_in_media: mi.Float | None = None,
     ) -> None:
         self.terms = terms
         self.exponent, self.splits, self.selection = exponent, splits, selection
@@ -112,6 +119,10 @@ class PartialSums:
         self.image_count = self.ratio(mi.Float(light_paths))
         #: ``merging``, raised to the exponent.
         self.merging = None if merging is None else self.ratio(merging)
+        #: ``merging_in_media``, raised to the exponent.
+        self.merging_in_media = None
+        if merging_in_media is not None:
+            self.merging_in_media = self.ratio(merging_in_media)
         self.merges_all = merges_all
         self._has_clear_curves = has_clear_curves
 
@@ -160,10 +171,24 @@ class PartialSums:
         """
         others = sums.last + self.ratio(reverse_pdf) * sums.dVC
         if self.merging is not None and self.merges_all:
-            others += self.merging
+            others += self._merging(sums)
         elif self.merging is not None and sums.is_caustic is not None:
-            others += dr.select(sums.is_caustic, self.merging, 0)
+            others += dr.select(sums.is_caustic, self._merging(sums), 0)
         return self.ratio(density) * others
+
+    def merging_at(self, si: mi.SurfaceInteraction3f, medium: mi.MediumPtr) -> mi.Float | None:
+        """The density of merging at a vertex, on a surface or in ``medium``, raised to the
+        exponent; ``None`` if it is the same at all vertices. In media, it contains the extinction:
+        merging is the only technique that samples the vertex twice."""
+        if self.merging_in_media is None:
+            return None
+        extinction = self.ratio(self.terms.extinction(si, medium))
+        in_medium = self.merging_in_media * extinction
+        return dr.select(is_in_medium(si), in_medium, self.merging)
+
+    def _merging(self, sums: Sums) -> mi.Float:
+        """The density of merging at the last vertex of a subpath, raised to the exponent."""
+        return self.merging if sums.merging is None else sums.merging
 
     def merging_weight(
         self, light: Sums, pdf: mi.Float, camera: Sums, reverse_pdf: mi.Float
@@ -179,7 +204,7 @@ class PartialSums:
         """
         others = light.last + self.ratio(pdf) * light.dVC
         others += camera.last + self.ratio(reverse_pdf) * camera.dVC
-        return weight(others / self.merging)
+        return weight(others / self._merging(camera))
 
     def competing_with_merging(
         self,
@@ -192,7 +217,7 @@ class PartialSums:
         """The densities that compete with merging. The parameters are the same as for
         :meth:`merging_weight`; ``is_first`` tells whether the vertex of the light path, and of the
         camera path, is the first one of its path."""
-        inverse, one = dr.rcp(self.merging), mi.Float(1)
+        inverse, one = dr.rcp(self._merging(camera)), mi.Float(1)
         kinds = self.by_kind(one, light, pdf, is_first[0], by_light=True)
         kinds += self.by_kind(one, camera, reverse_pdf, is_first[1], by_light=False)
         return CompetingDensities(
@@ -200,21 +225,27 @@ class PartialSums:
         )
 
     def merging_before(
-        self, sums: Sums, squared_distance: mi.Float, cosine: mi.Float
+        self,
+        sums: Sums,
+        squared_distance: mi.Float,
+        cosine: mi.Float,
+        merging: mi.Float | None = None,
     ) -> mi.Float | float:
         """For a camera path that leaves a vertex by a delta lobe: the term of dVC at this vertex
         for merging at the previous vertex, where light arrives from that lobe.
 
         Parameters:
             sums: The sums at the vertex with the delta lobe.
-            squared_distance, cosine: The squared length of the segment to the previous vertex, and
-                the cosine there between the segment and the geometric normal.
+            squared_distance, cosine: The squared length of the segment to the previous vertex (see
+                :meth:`arrive`), and the cosine there between the segment and the geometric normal.
+            merging: The density of merging there (:meth:`merging_at`).
         """
         if self.merging is None or self.merges_all:
             return 0.0
         # dVCM is 0 if the path left the previous vertex by a delta lobe too
         ratio = self.ratio(cosine / squared_distance)
-        return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * self.merging, 0)
+        merging = self.merging if merging is None else merging
+        return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * merging, 0)
 
     def arrive(
         self,

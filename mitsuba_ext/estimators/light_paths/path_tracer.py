@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,9 +30,10 @@ from .light_numbers import LightPathRays
 from .light_walk import LightWalk
 from .medium_programs import BidirectionalProgramInMedia, LightSumsInMedia
 from .medium_scattering import MediumTerms
-from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths
-from .merging.merging_radius import MergingRadius
-from .merging.vertex_grid import VertexGrid
+from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths, disk_area
+from .merging.merging_in_media import MergedInMedia, ball_volume
+from .merging.merging_radius import MergingRadii
+from .merging.vertex_grid import VertexGrid, all_of
 from .partial_sums import PartialSums
 from .scattering import SurfaceTerms
 from .sensor import ConnectableSensor
@@ -64,7 +66,7 @@ class BidirectionalPathTracer:
         is_alone: Whether the sample in a lane must not depend on other lanes. If so, a camera path
             is connected only to the light path in its lane.
         skips_direct: Whether paths of one and two segments are left out.
-        radius: The radius within which vertices are merged; ``None`` if they are not.
+        radii: The radii within which vertices are merged; ``None`` if they are not.
         merges_all: See :class:`PartialSums`.
         light_paths: Number of light paths for each camera path. It must be 1 where paths of
             different lanes cannot be connected (see ``selection`` and ``is_alone``).
@@ -81,7 +83,7 @@ class BidirectionalPathTracer:
     observer: TechniqueObserver | None = None
     is_alone: bool = False
     skips_direct: bool = False
-    radius: MergingRadius | None = None
+    radii: MergingRadii | None = None
     merges_all: bool = False
     light_paths: float = 1.0
     most_lanes: int = 0
@@ -100,7 +102,7 @@ class BidirectionalPathTracer:
         observer, splits = self.observer, False
         if observer is not None:
             observer.start(rays, Available(
-                self.sensor is not None, self.connections > 0, self.radius, not own_lane,
+                self.sensor is not None, self.connections > 0, self.radii, not own_lane,
                 self.most_lanes,
             ))  # fmt: skip
             walk = replace(walk, observer=Observers([walk.observer, observer]))
@@ -108,19 +110,23 @@ class BidirectionalPathTracer:
         lanes = dr.width(rays.ray)
         light = LightPathRays.of(sampler, rays, self.light_paths)
         per_camera_path = light.count / lanes
-        radius, merging = None, None
-        if self.radius is not None:
-            # If times or wavelengths differ, paths merge only with the same sample of other pixels
-            paths = min(lanes, self.radius.pixels) if own_lane else light.count
-            radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
-            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
         # Light paths scatter in media
         in_media = self.outside is not None
         terms = MediumTerms(may_have_grids(scene)) if in_media else SurfaceTerms()
+        disk, ball, merging, merging_in_media = None, None, None, None
+        if self.radii is not None:
+            # If times or wavelengths differ, paths merge only with the same sample of other pixels
+            paths = min(lanes, self.radii.pixels) if own_lane else light.count
+            disk, ball = self._next_radii(paths, light.count // paths)
+            share = dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
+            merging = mi.Float(0) if disk is None else disk_area(disk) * share
+            if in_media:
+                merging_in_media = mi.Float(0) if ball is None else ball_volume(ball) * share
         sums = PartialSums(
             dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,
             merges_all=self.merges_all, light_paths=dr.opaque(mi.Float, per_camera_path),
             has_clear_curves=self.emission.has_clear_curves, terms=terms,
+            merging_in_media=merging_in_media,
         )  # fmt: skip
         image = None
         if self.sensor is not None:
@@ -155,13 +161,11 @@ class BidirectionalPathTracer:
                     scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
                     walk.observer, observer, walk.channels,
                 )  # fmt: skip
-            if radius is not None:
-                kept = None if self.merges_all else vertices.is_caustic
-                grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
-                subpaths = MergedSubpaths(
-                    vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
-                    observer, walk.channels,
-                )  # fmt: skip
+            merged = functools.partial(self._merged, scene, vertices, sums, own_lane, in_media)
+            if disk is not None:
+                subpaths = merged(MergedSubpaths, disk, paths, subpaths)
+            if ball is not None:
+                subpaths = merged(MergedInMedia, ball, paths, subpaths)
         kind = BidirectionalProgramInMedia if in_media else BidirectionalProgram
         program: PathProgram = kind(
             scene, sums, self.emission, self.sensor, observer, subpaths
@@ -184,6 +188,27 @@ class BidirectionalPathTracer:
         if observer is not None:
             observer.traced(sample, whole)
         return whole
+
+    def _next_radii(self, paths: int, groups: int) -> list[mi.Float | None]:
+        """The radii of disks and balls of the next pass; see :meth:`MergingRadius.next`."""
+        return [
+            radius and dr.opaque(mi.Float, radius.next(paths, groups))
+            for radius in (self.radii.disk, self.radii.ball)
+        ]
+
+    def _merged(
+        self, scene, vertices, sums, own_lane, in_media, kind, radius, paths, others
+    ) -> MergedSubpaths:
+        """Merges vertices on surfaces, or in media, within ``radius``; ``kind`` is the class."""
+        where = None
+        if in_media:
+            where = vertices.is_in_medium if kind is MergedInMedia else vertices.is_on_surface
+        kept = all_of(where, None if self.merges_all else vertices.is_caustic)
+        grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
+        return kind(
+            vertices, grid, sums, Heroes(scene), self.walk.max_depth, paths, own_lane, others,
+            self.observer, self.walk.channels,
+        )  # fmt: skip
 
 
 def camera_paths(

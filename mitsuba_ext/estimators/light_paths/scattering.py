@@ -95,6 +95,11 @@ class SurfaceTerms:
         return geometric_cosine(si, d)
 
 
+def is_in_medium(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a vertex lies in a participating medium, and not on a surface."""
+    return si.shape == None  # noqa: E711
+
+
 def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
     """The factor of the weight of a sample from a delta lobe, drawn with the mode ``Importance``,
     that makes the integrand the same as in ``path`` (Veach, PhD thesis, section 5.3.2).

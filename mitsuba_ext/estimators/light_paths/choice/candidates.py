@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
-from ..merging.merging_radius import MergingRadius
+from ..merging.merging_radius import MergingRadii
 
 #: The numbers of light paths, for each camera path, that pilots choose from. Merging needs many:
 #: the fewer there are, the wider is the radius in which a disk holds enough vertices. But four were
@@ -52,7 +52,7 @@ class Available:
     Attributes:
         has_image: Whether light paths are connected to the sensor.
         connects: Whether light paths are connected to camera paths.
-        radius: The radius within which vertices are merged; ``None`` if they are not.
+        radii: The radii within which vertices are merged; ``None`` if they are not.
         are_shared: Whether a camera path can be connected to any light path. If not, each camera
             path has its own light path.
         most_lanes: The largest number of camera paths in a pass, with one light path for each; 0
@@ -61,24 +61,24 @@ class Available:
 
     has_image: bool
     connects: bool
-    radius: MergingRadius | None
+    radii: MergingRadii | None
     are_shared: bool
     most_lanes: int = 0
 
     def samples_per_vertex(self, light_paths: float, spp: int, pixels: int) -> float:
         """:meth:`MergingRadius.samples_per_vertex` in a render of ``spp`` samples per pixel."""
-        if self.radius is None:
+        if self.radii is None:
             return 1.0
         passes = 1
         if self.most_lanes > 0:
             in_pass = max(1, int(self.most_lanes / max(1.0, light_paths)) // pixels)
             passes = -(-spp // in_pass)
-        return self.radius.samples_per_vertex(light_paths, spp / passes, passes)
+        return self.radii.samples_per_vertex(light_paths, spp / passes, passes)
 
 
 def candidates(available: Available) -> list[Candidate]:
     """The candidates of a render; the first one is ``path``, the second one has all techniques."""
-    can_merge = available.radius is not None
+    can_merge = available.radii is not None
     everything = Candidate(1.0, int(available.connects), can_merge)
     found = [Candidate(0.0), everything]
     for merges in (False, True) if can_merge else (False,):

@@ -9,7 +9,6 @@ Vertex Connection and Merging*, technical report, 2012.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +26,7 @@ from ..light_vertices import LightVertex, VertexCache, group_of
 from ..light_walk import LightWalk
 from ..partial_sums import PartialSums
 from ..scattering import geometric_cosine, reverse_density
-from .vertex_grid import VertexCounts, VertexGrid
+from .vertex_grid import Kept, VertexCounts, VertexGrid
 
 #: Vertices merge if their surfaces face about the same way, and within a flat cylinder. Light would
 #: otherwise leak around corners and through thin walls. These are the least cosine between the
@@ -112,28 +111,16 @@ def scene_diagonal(scene: mi.Scene) -> float:
 
 
 def suitable_radius(
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    light_walk: LightWalk,
-    footprint: float,
-    pixels: int,
-    only_caustic: bool,
+    scene: mi.Scene, vertices: VertexCache, kept: Kept | None, footprint: float, pixels: int
 ) -> float | None:
     """The radius in which a disk holds ``PHOTONS_PER_DISK`` vertices, with one light path per
-    pixel, on average over the vertices on surfaces. A few light paths measure it. ``None`` if they
-    leave too few vertices.
+    pixel, on average over the vertices. ``None`` if there are too few vertices.
 
     Parameters:
-        light_walk: Traces the light paths.
+        vertices: The vertices of a few light paths (:func:`pilot_vertices`).
+        kept: Which of them are merged on surfaces; see :class:`VertexGrid`.
         footprint: The width of a pixel where the camera sees the scene.
-        only_caustic: Whether vertices are merged only where light arrives from a delta lobe.
     """
-    vertices = pilot_vertices(scene, sensor, light_walk)
-    if vertices is None:
-        return None
-    kept = None if light_walk.outside is None else vertices.is_on_surface
-    if only_caustic:
-        kept = vertices.is_caustic
     least = 2 * footprint or scene_diagonal(scene) / 500
     return disk_radius(vertices, kept, PHOTONS_PER_DISK * PILOT_PATHS / pixels, least)
 
@@ -156,7 +143,7 @@ def pilot_vertices(
 
 def disk_radius(
     vertices: VertexCache,
-    kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None,
+    kept: Kept | None,
     count: float,
     least: float,
 ) -> float | None:
@@ -185,6 +172,11 @@ def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi
     return [dr.select(active, new, old) for new, old in zip([value, *stack[:-1]], stack)]
 
 
+def disk_area(radius: mi.Float) -> mi.Float:
+    """The area of a disk."""
+    return dr.pi * dr.square(radius)
+
+
 class MergedSubpaths(Subpaths):
     """Adds, at each vertex of a camera path, the light that light paths bring to nearby vertices.
 
@@ -202,6 +194,9 @@ class MergedSubpaths(Subpaths):
         observer: Receives what merging adds.
         channels: Adds it to the channels of light path expressions; ``None`` without any.
     """
+
+    #: The area in which vertices are found, from its radius.
+    _measure = staticmethod(disk_area)
 
     def __init__(
         self,
@@ -222,10 +217,6 @@ class MergedSubpaths(Subpaths):
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
         # The density of light paths, for one vertex within the radius
         self._per_vertex = dr.rcp(self._measure(grid.radius) * dr.opaque(mi.Float, paths))
-
-    def _measure(self, radius: mi.Float) -> mi.Float:
-        """The area in which vertices are found."""
-        return dr.pi * dr.square(radius)
 
     @dr.syntax
     def gather(self, scene, sampler, vertex, active):

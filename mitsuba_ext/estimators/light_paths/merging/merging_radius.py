@@ -80,3 +80,32 @@ class MergingRadius:
         shrinks = by_samples if self.footprint == 0 else number ** (self.decay - 1) / per_pixel
         power = 1 / self.dimensions
         return min(self.first * shrinks**power, self.widest * by_samples**power)
+
+
+@dataclass
+class MergingRadii:
+    """Where vertices are merged: at least one of the two is not ``None``.
+
+    Attributes:
+        disk: The radius on surfaces; ``None`` if none are merged there.
+        ball: The radius in participating media; ``None`` if none are merged there.
+    """
+
+    disk: MergingRadius | None
+    ball: MergingRadius | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return (self.disk or self.ball).pixels
+
+    def of_coarse_film(self, pixel_width: float) -> MergingRadii:
+        """:meth:`MergingRadius.of_coarse_film` of both."""
+        return MergingRadii(
+            self.disk and self.disk.of_coarse_film(pixel_width),
+            self.ball and self.ball.of_coarse_film(pixel_width),
+        )
+
+    def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
+        """:meth:`MergingRadius.samples_per_vertex` of disks, or of balls if there are no disks."""
+        return (self.disk or self.ball).samples_per_vertex(light_paths, spp, passes)

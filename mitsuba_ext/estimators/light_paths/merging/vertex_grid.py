@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,6 +21,16 @@ _PER_DIAMETER, _ROWS = 2, 4
 #: their groups.
 Kept = Callable[["mi.UInt32", "mi.Bool"], "mi.Bool"]
 Group = Callable[["mi.UInt32", "mi.Bool"], "mi.UInt32"]
+
+
+def all_of(*conditions: Kept | None) -> Kept | None:
+    """Keeps the vertices that fulfil all of these conditions; ``None`` stands for no condition."""
+    given = [condition for condition in conditions if condition is not None]
+    if len(given) < 2:
+        return given[0] if given else None
+    return lambda index, active: functools.reduce(
+        lambda kept, condition: kept & condition(index, active), given, active
+    )
 
 
 class Counted(NamedTuple):

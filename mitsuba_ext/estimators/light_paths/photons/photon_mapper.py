@@ -28,7 +28,7 @@ from ..merging.merging import MergedSubpaths
 from ..merging.merging_radius import MergingRadius
 from ..merging.vertex_grid import VertexGrid
 from ..path_memory import bytes_of_photons
-from .medium_photons import MergedInMedia, MergedOutside, PassesThrough, enters
+from .medium_photons import MergedOutside, PassesThrough, PhotonsInMedia, enters
 
 
 class SpecularPaths(EndingProgram):
@@ -145,7 +145,7 @@ class PhotonMapper:
             return merged
         radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
         grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
-        return MergedInMedia(
+        return PhotonsInMedia(
             vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene),
             self.observer, self.walk.channels,
         )  # fmt: skip

@@ -36,14 +36,13 @@ def photon_mapper(
     integrator: PathIntegrator,
     request: Request,
     merging: MergingParameters,
-    radius_in_media: float = 0.0,
     light_paths: float = 1.0,
 ) -> PhotonMapper:
     """The estimator of progressive photon mapping, for a scene that has lights, with the parameters
     of an integrator. A few light paths measure the radii that are 0.
 
     Parameters:
-        merging, radius_in_media, light_paths: See :class:`sppm`.
+        merging, light_paths: See :class:`sppm`.
 
     Raises:
         NotImplementedError: A light cannot emit light paths, or light passes through a curve.
@@ -57,11 +56,9 @@ def photon_mapper(
         emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
     )
     before = round(request.samples_before * light_paths)
-    radius, ball = merging.radius_of(scene, sensor, light_walk, False, before, True), None
-    if outside is not None:
-        ball = merging.ball_of(scene, sensor, light_walk, before, radius_in_media)
+    radii = merging.radii_of(scene, sensor, light_walk, False, before, True)
     walk = Walk(
         integrator.max_depth, integrator.rr_depth, integrator.hide_emitters,
         next_event=NoConnections(), query=query, channels=integrator.channels,
     )  # fmt: skip
-    return PhotonMapper(walk, light_walk, radius, ball, light_paths)
+    return PhotonMapper(walk, light_walk, radii.disk, radii.ball, light_paths)
