@@ -199,8 +199,8 @@ def _walk(scene, numbers, ray, count, active, mode):
 
 
 #: How often two vertices of subpaths are connected, and how many light paths there are for each
-#: camera path, for weights: not once, as all else.
-CONNECTIONS, LIGHT_PATHS = 0.4, 3.0
+#: camera path, for weights: not once, as all else. And the density of merging.
+CONNECTIONS, LIGHT_PATHS, MERGING = 0.4, 3.0, 100.0
 
 
 def weights_of_techniques(
@@ -210,15 +210,19 @@ def weights_of_techniques(
     sensor: ConnectableSensor | None,
     next_event: EmitterSampling,
     selection: SubpathSelection | None = None,
+    merging: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As the estimator computes them: the weight of each technique, [s, path], 0 where it cannot
-    find the path; which of the lanes have a path; and for all techniques but the first two the
-    ratios of the densities of these to its own, and the squared ratios of other connections and of
-    the light image, [s − 2, 4, path]."""
+    find the path, followed, with ``merging`` (see ``vcm``), by the weight of merging at each
+    vertex; which of the lanes have a path; and for all techniques but the first two the ratios of
+    the densities of these to its own, and the squared ratios of other connections and of the light
+    image, [s − 2, 4, path]."""
     terms = SurfaceTerms() if paths.transmittance is None else MediumTerms(False)
     sums = PartialSums(
-        CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS, terms=terms
-    )
+        CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS, terms=terms,
+        merging=merging and mi.Float(MERGING), merges_all=merging == "all",
+        merging_in_media=mi.Float(MERGING) if merging and terms.sees_media else None,
+    )  # fmt: skip
     active = paths.active
     passed = paths.transmittance or [1.0] * (len(paths.vertices) + 1)
     kind = BidirectionalProgramInMedia if terms.sees_media else BidirectionalProgram
@@ -232,8 +236,12 @@ def weights_of_techniques(
     at_first = mi.Bool(True)
     arrived = sums.arrive(first, si, mi.Float(1), at_first, by_light=True)
     by_light = [
-        replace(first, region=arrived.region, count=arrived.count, by_kind=mi.Vector2f(0))
-    ]
+        replace(
+            first, region=arrived.region, count=arrived.count, by_kind=mi.Vector2f(0),
+            is_caustic=merging and mi.Bool(False),
+            merging=sums.merging_at(si, vertices[0].medium),
+        )
+    ]  # fmt: skip
     # Which techniques scatter only where their densities are not 0
     from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
     for a, b, T in zip(vertices, vertices[1:], passed[1:]):
@@ -249,11 +257,12 @@ def weights_of_techniques(
             a is vertices[0],
             by_light=True,
         )  # fmt: skip
-        by_light.append(
-            sums.arrive(
-                left, b.from_light, dr.squared_norm(b.p - a.p) / T, ~at_first, by_light=True
-            )
+        arrived = sums.arrive(
+            left, b.from_light, dr.squared_norm(b.p - a.p) / T, ~at_first, by_light=True
         )
+        arrived.is_caustic = merging and a.is_delta
+        arrived.merging = sums.merging_at(b.from_light, b.medium)
+        by_light.append(arrived)
 
     # ----- Subpaths from the camera -----
     path = PathState(
@@ -372,6 +381,16 @@ def weights_of_techniques(
         ratios.append([*(sums.by_camera(*ends) / LIGHT_PATHS), *kinds])
     # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
     can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
+
+    # ----- Merging -----
+    for i, v in enumerate(vertices if merging else ()):
+        to_light, to_camera = v.from_light.wi, v.from_camera.wi
+        pdf = terms.density(ctx, v.bsdf, v.from_camera, v.medium, to_light, active)
+        reverse = terms.density(ctx, v.bsdf, v.from_light, v.medium, to_camera, active)
+        merged = sums.merging_weight(by_light[i], pdf, by_camera[i].path.history, reverse)
+        merges = ~v.is_delta if merging == "all" else by_light[i].is_caustic & ~v.is_delta
+        found.append(dr.select(merges, merged, 0))
+        can.append(from_light[i] & from_camera[i + 1])
     found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]
     dr.eval(found, ratios, active)
     shape = np.array(active).shape

@@ -124,6 +124,16 @@ def glass_in_fog() -> Scene:
     return {**fog_around_the_camera("area", homogeneous(0.2)), "ball": ball}
 
 
+def caustic_in_fog() -> Scene:
+    """A large lamp, whose light a ball of glass bundles in coloured fog."""
+    medium = {**homogeneous([0.6, 0.8, 1.0], 0.9), "id": "medium"}
+    ball = {"type": "sphere", "radius": 0.45, "center": [0.1, 0.5, 0.0],
+            "bsdf": {"type": "dielectric"}, "exterior": {"type": "ref", "id": "medium"}}
+    lamp = {"type": "sphere", "radius": 0.8, "center": [0.3, 3.0, 0.5], "emitter": area(6.0)}
+    scene = fog(medium={"type": "ref", "id": "medium"}, ball=ball)
+    return {"type": "scene", "medium": medium, **scene, "light": lamp}
+
+
 def without_boundary() -> Scene:
     """Fog everywhere: only the sensor knows of it."""
     scene = {k: v for k, v in fog("area_inside").items() if k != "fog"}

@@ -179,20 +179,39 @@ def test_weights_of_light_vertices_that_are_chosen_by_regions_add_up(bsdf: str) 
         assert_they_add_up(weights(scene, light, camera, selection=selection)[0])
 
 
+@pytest.mark.parametrize("merging", ["all", "caustics"])
+@pytest.mark.parametrize("name", some("mirror", of=["rough glass", "glass", "mirror"]))
+def test_weights_with_merging_add_up(merging: str, name: str) -> None:
+    """The weights of merging come last: one for each vertex."""
+    scene = mi.load_dict(stage_with_ball({**MATERIALS, **SPECULAR}[name]()), optimize=False)
+    emission, eye = LightEmission(scene), scene.sensors()[0]
+    shares = []
+    for light, camera in ((2, 1), (1, 2)):
+        paths = trace(scene, emission, eye, light, camera)
+        found, exists, _ = weights_of_techniques(
+            scene, paths, emission, ConnectableSensor(eye), EmitterSampling(), merging=merging
+        )
+        assert_they_add_up(found[:, exists])
+        shares.append(found[light + camera + 2 :, exists].sum(axis=0).max())
+    assert max(shares) > 0.1 or (merging, name) == ("caustics", "rough glass")
+
+
+@pytest.mark.parametrize("merging", some("all", of=[None, "all"]))
 @pytest.mark.parametrize("light", some("area", "environment", of=fogs.LIGHTS))
-def test_weights_of_paths_in_a_medium_add_up(light: str) -> None:
+def test_weights_of_paths_in_a_medium_add_up(light: str, merging: str | None) -> None:
     """For any transmittances of the segments."""
     scene = mi.load_dict({
         "type": "scene", "light": fogs.LIGHTS[light],
-        "sensor": fogs.camera(medium=fogs.homogeneous(g=0.5)),
+        "sensor": fogs.camera(medium=fogs.homogeneous([0.5, 1.0, 3.0], g=0.5)),
     })  # fmt: skip
     emission, eye = LightEmission(scene), scene.sensors()[0]
     for count in (1, 2, 3):
         paths = trace_in_medium(scene, emission, eye, count)
         found, exists, _ = weights_of_techniques(
-            scene, paths, emission, ConnectableSensor(eye), EmitterSampling()
+            scene, paths, emission, ConnectableSensor(eye), EmitterSampling(), merging=merging
         )
         assert_they_add_up(found[:, exists])
+        assert merging is None or found[count + 2 :, exists].max() > 0.1
 
 
 # ---- Densities with which camera paths find what light paths find ----

@@ -1,4 +1,4 @@
-"""Light paths in participating media: ``light_tracer`` and ``bdpt`` in fog."""
+"""Light paths in participating media: ``light_tracer``, ``bdpt`` and ``vcm`` in fog."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from tests.support.fogs import (
     HARD_SCENES,
     SCENES,
     camera,
+    caustic_in_fog,
     cube,
     fog,
     homogeneous,
 )
-from tests.support.stage import area, diffuse
+from tests.support.stage import area, diffuse, lookat
 from tests.support.statistical import (
     assert_images_are_sound,
     assert_same_quarters,
@@ -125,6 +126,50 @@ def test_expressions_divide_the_light_of_light_paths_in_fog() -> None:
     np.testing.assert_allclose(*parts, rtol=0.05)
 
 
+# ---- Merging ----
+
+
+def merge(radius: float, spp: int, **parameters: Any) -> mi.Integrator:
+    """``vcm`` with the same radius on surfaces and in media, in passes of ``spp`` samples."""
+    radii = {"radius": radius * spp**0.5, "radius_in_media": radius * spp ** (1 / 3)}
+    return make("vcm", 6, radius_decay=1.0, **radii, **parameters)
+
+
+@pytest.mark.parametrize("merging", some("caustics", of=["caustics", "all"]))
+def test_merging_in_media_has_the_image_of_volpath(merging: str) -> None:
+    """Without connections of light paths, merging has large weights."""
+    scene = mi.load_dict(caustic_in_fog(), optimize=False)
+    alone = {"connections": 0, "light_image": False}
+    found = batches(scene, merge(0.04, 256, merging=merging, **alone), 256, range(1, 7))
+    assert_images_are_sound(found)
+    expected = batches(scene, make("volpath", 6), 512, range(101, 107))
+    assert_same_quarters(found, expected, 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_merging_in_spectral_media_has_the_image_of_volpath(variant: str) -> None:
+    scene = mi.load_dict(caustic_in_fog(), optimize=False)
+    alone = {"connections": 0, "light_image": False}
+    # Photons of a pass have wavelengths of their own
+    found = batches(scene, merge(0.06, 1, merging="all", **alone), 256, range(1, 7))
+    expected = batches(scene, make("volpath", 6), 1024, range(101, 107))
+    assert_same_quarters(found, expected, 0.02)
+
+
+def test_light_does_not_leak_through_the_surface_of_glass() -> None:
+    """Two fogs, of which only the outer one is lit; a black film lies between them."""
+    black = {"type": "mask", "opacity": 1.0, "bsdf": diffuse(0.0)}
+    inner = {"type": "sphere", "radius": 0.7, "bsdf": black, "interior": homogeneous(5.0),
+             "exterior": homogeneous(0.5)}  # fmt: skip
+    eye = camera()
+    eye["medium"] = homogeneous(5.0)
+    eye["to_world"] = lookat([0, 0, 0.1], [0, 0, -1], [0, 1, 0])
+    scene = mi.load_dict(fog("area", homogeneous(0.5), inner=inner, sensor=eye))
+    image = np.array(merge(0.3, 16, merging="all").render(scene, spp=16))
+    assert not image.any()
+
+
 # ---- Limits ----
 
 
@@ -157,11 +202,13 @@ def test_light_paths_find_fog_behind_glass_that_volpath_does_not() -> None:
     assert found[4:12, 4:12].mean() > 0.01
 
 
-@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
-def test_media_add_nothing_to_kernels_of_scenes_without_any(name: str) -> None:
+@pytest.mark.parametrize(("name", "parameters"), [
+    ("vcm", {"merging": "all"}), ("light_tracer", {})
+])  # fmt: skip
+def test_media_add_nothing_to_kernels_of_scenes_without_any(name: str, parameters: dict) -> None:
     """Kernels of scenes without media do not call media."""
     scene = mi.load_dict({k: v for k, v in fog("area").items() if k != "fog"})
-    integrator = make(name)
+    integrator = make(name, **parameters)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         integrator.render(scene, spp=4)

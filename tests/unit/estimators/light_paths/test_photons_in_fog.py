@@ -118,7 +118,7 @@ def test_the_medium_outside_is_that_behind_the_last_boundary() -> None:
     assert outside({**without_boundary(), "hole": hole})
 
 
-@pytest.mark.parametrize("name", ["vcm", "instant_radiosity", "photon_map"])
+@pytest.mark.parametrize("name", ["instant_radiosity", "photon_map"])
 def test_others_with_light_paths_refuse_media_and_name_sppm(name: str) -> None:
     with pytest.raises(NotImplementedError, match='do not scatter in a medium.*"sppm"'):
         make(name).render(mi.load_dict(fog()), spp=1)
