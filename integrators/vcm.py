@@ -26,8 +26,9 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
      * - merging
        - |string|
        - Where vertices are merged: with :monosp:`caustics`, only where light arrives from a mirror
-         or smooth glass; with :monosp:`all`, on all rough surfaces, as in the source; with
-         :monosp:`none`, nowhere, which makes the integrator :class:`bdpt`. (Default: caustics)
+         or smooth glass; with :monosp:`all`, on all rough surfaces and in all media, as in the
+         sources; with :monosp:`none`, nowhere, which makes the integrator :class:`bdpt`. (Default:
+         caustics)
      * - radius
        - |float|
        - Radius within which vertices are merged in a first pass of one sample per pixel, in units
@@ -36,10 +37,16 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
          vertices of a pass in places that have any. It is then at most 8 pixel widths at the first
          sample, and this limit shrinks with the number of samples so far, in passes of any size.
          (Default: 0)
+     * - radius_in_media
+       - |float|
+       - As ``radius``, for vertices in participating media, which are merged in a ball: a pass of k
+         samples per pixel uses 1/k of the volume. 0 stands for a radius with which half of the
+         balls contain about eight vertices or more. (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i is the squared radius of the first pass times i
-         to the power of α − 1. With 1, it is constant. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is the squared radius (or
+         cube) of the first pass times i to the power of α − 1. With 1, it is constant. (Default:
+         0.75)
      * - (Parameters of bdpt)
        - |several|
        - The parameters of :class:`bdpt`: light_paths, connections, light_image, subpath_selection,
@@ -53,7 +60,7 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     vertices.
 
     **Use it when** caustics are seen through water or glass, or in mirrors: no connection finds
-    them. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time and adds
+    them. With :monosp:`merging=all`, also for skin, milk and marble. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time and adds
     a little bias.
 
     Merging is biased with any finite number of samples: it blurs light over the radius. The bias
@@ -67,15 +74,18 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     the same time: otherwise the vertices of other paths could not be merged. Errors of colour and
     motion blur are then the same in all pixels; they fall faster than noise.
 
-    With merging, participating media are refused (use :monosp:`sppm`, :class:`bdpt` or
-    :monosp:`composed_path`). The parameter
-    ``technique_images`` of :class:`bdpt` is refused with merging.
+    **Participating media** are rendered as with :class:`bdpt`. Vertices in media merge where both
+    lie in the same medium. Where a ball reaches out of the medium, it finds too little light.
+
+    The parameter ``technique_images`` of :class:`bdpt` is refused with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,
     *Implementing Vertex Connection and Merging*, technical report, 2012; C. Knaus, M. Zwicker,
     *Progressive Photon Mapping: A Probabilistic Approach*, ACM Transactions on Graphics 30(3),
-    2011 (radius).
+    2011 (radius); J. Křivánek et al., *Unifying Points, Beams, and Paths in Volumetric Light
+    Transport Simulation*, ACM Transactions on Graphics 33(4), 2014 (media; merging of points, not
+    of beams).
 
     .. tabs::
         .. code-tab:: xml

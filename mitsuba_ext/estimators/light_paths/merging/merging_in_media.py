@@ -66,7 +66,7 @@ class MergedInMedia(MergedSubpaths):
             vertex.path.hero_is_alone, other.hero_is_alone, value, vertex.bsdf, si, wo
         )
         σ_s = terms.scattering(far, medium, active)
-        value *= other.β * dr.select(σ_s > 0, dr.rcp(σ_s), 0)
+        value *= mi.Spectrum(other.β * dr.select(σ_s > 0, dr.rcp(σ_s), 0))
         _, reverse = terms.phase(si, medium, wo, si.wi, active)
         ends = other.history, pdf, vertex.path.history, reverse
         mis = sums.merging_weight(*ends)
