@@ -60,8 +60,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     vertices.
 
     **Use it when** caustics are seen through water or glass, or in mirrors: no connection finds
-    them. With :monosp:`merging=all`, also for skin, milk and marble. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time and adds
-    a little bias.
+    them. With :monosp:`merging=all`, also for skin, milk and marble. **Not when** :class:`bdpt` or
+    :monosp:`path` finds all light: merging takes time and adds a little bias.
 
     Merging is biased with any finite number of samples: it blurs light over the radius. The bias
     falls with the squared radius, which shrinks from pass to pass, so the image converges. The bias

@@ -67,6 +67,7 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool,
     passes_emitters: bool = False,
+    reach: mi.Float | None = None,
 ) -> tuple[mi.Spectrum, mi.Float, Way | None]:
     """An unbiased estimate of the transmittance between a vertex and a point on a light. In
     homogeneous media, it is computed, or estimated with a random distance; in others, it is
@@ -85,6 +86,8 @@ def transmittance(
         exact: Whether the transmittance of homogeneous media is computed without random distances.
         finds_way: Whether the :class:`Way` of the light is returned as well.
         passes_emitters: Whether area lights let light pass, because they are hidden.
+        reach: The length of the ray from ``ds.p`` with which a path begins there; ``None`` if there
+            is no limit. Behind an index-matched surface, the path goes on without a limit.
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
@@ -92,6 +95,7 @@ def transmittance(
     left = query.starts.towards(si, ds.p, ds.n).maxt
     T, known = mi.Spectrum(1), mi.Float(1)
     way = Way(dr.zeros(mi.MediumInteraction3f), mi.Float(0)) if finds_way else None
+    first = left  # The length of the first segment from ds.p
     active = mi.Bool(active)
     while dr.hint(active, label="transmittance"):
         in_medium = active & (medium != None)  # noqa: E711
@@ -128,7 +132,11 @@ def transmittance(
         onward.maxt = ray.maxt - met.t
         ray = dr.select(is_met, onward, ray)
         left = dr.select(is_met, left - met.t, left)
+        if dr.hint(reach is not None, mode="scalar"):
+            first = dr.select(is_met & ~is_hidden, left, first)
         active &= is_met & (ray.maxt > 0)
+    if dr.hint(reach is not None, mode="scalar"):
+        T = dr.select(first < reach, T, 0)
     return T, known, way
 
 

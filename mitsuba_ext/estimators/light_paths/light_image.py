@@ -101,12 +101,12 @@ class LightImage:
         """The splats, and the number of shadow rays of each vertex."""
         index, active = vertices.every()
         vertex = vertices.at(index, active)
-        si = vertex.si
+        si, terms = vertex.si, self._terms
         sample = mi.Point2f(0.5)
         if self._sensor.needs_aperture_sample:
             word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
             sample = hashed_2d(word, vertex.depth)
-        connection, lens_weight = self._sensor.connect(si, sample, active)
+        connection, lens_weight = self._sensor.connect(si, sample, active, not terms.sees_media)
         active = active & connection.active
         if self._least_depth > 1:
             active &= vertex.depth >= self._least_depth
@@ -114,7 +114,7 @@ class LightImage:
             active &= si.shape.emitter() == None  # noqa: E711
         to_camera = si.to_local(connection.d)
         heroes = Heroes(self._scene)
-        terms, bsdf = self._terms, si.bsdf()
+        bsdf = si.bsdf()
         value, reverse_pdf = terms.adjoint(
             heroes.context(), bsdf, si, vertex.medium, to_camera, active
         )
@@ -181,5 +181,5 @@ class LightImage:
             numbers = HashedNumbers(word ^ (vertex.depth << 16), mi.UInt32(0))
         return self._terms.transmittance(
             self._query, self._scene, vertex.si, vertex.medium, connection.direction_sample(),
-            numbers, active, self._hides_emitters,
+            numbers, active, self._hides_emitters, connection.reach,
         )  # fmt: skip

@@ -57,13 +57,14 @@ class MediumTerms(SurfaceTerms):
         numbers: Numbers | None,
         active: mi.Bool,
         passes_emitters: bool = False,
+        reach: mi.Float | None = None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """:func:`transmittance` between a vertex and ``ds.p``. ``numbers`` are used in media of
         varying density only."""
         # Their majorant is the same for all colours
         T, known, _ = transmittance(
             query, scene, si, ds, medium, mi.UInt32(0), self.has_grids, True, False, numbers,
-            active, passes_emitters,
+            active, passes_emitters, reach,
         )  # fmt: skip
         return T, known
 

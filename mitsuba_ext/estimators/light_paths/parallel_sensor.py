@@ -43,7 +43,11 @@ class ParallelSensor(ConnectableSensor):
         dr.make_opaque(self._to_camera, self._to_film, self._scale, self._inverse_area)
 
     def connect(
-        self, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+        self,
+        si: mi.SurfaceInteraction3f,
+        sample: mi.Point2f,
+        active: mi.Bool,
+        clips_far: bool = True,
     ) -> tuple[SensorConnection, float]:
         p = self._to_camera @ self._at_rest(si).p
         # Mitsuba's rays begin at the near clip plane, and their length is not scaled
@@ -51,11 +55,14 @@ class ParallelSensor(ConnectableSensor):
         film = self._to_film @ p
         uv = mi.Point2f(film.x, film.y) * self._size
         inside = dr.all((uv >= 0) & (uv < self._size))
-        active = active & inside & (dist > 0) & (dist < self._far - self._near)
+        reach = self._far - self._near
+        active = active & inside & (dist > 0)
+        if clips_far:
+            active &= dist < reach
         d = -viewing_axis(self._sensor, si.time)
         importance = dr.select(active, self._inverse_area, 0)
         return SensorConnection(
-            d, dist, si.p + d * dist, uv + self._offset, importance, active
+            d, dist, si.p + d * dist, uv + self._offset, importance, reach, active
         ), 1.0  # fmt: skip
 
     def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:

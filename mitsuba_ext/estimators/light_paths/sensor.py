@@ -27,6 +27,7 @@ class SensorConnection:
         importance: Density with which the sensor, from this point of the aperture, would send a
             camera ray here, per area across the ray; it integrates to 1 over the crop window. It
             is the factor of flux per solid angle.
+        reach: The length of the camera ray, which ends at the far clip plane.
         active: Points that are seen unless they are occluded.
     """
 
@@ -35,6 +36,7 @@ class SensorConnection:
     target: mi.Point3f
     position: mi.Point2f
     importance: mi.Float
+    reach: mi.Float
     active: mi.Bool
 
     def direction_sample(self) -> mi.DirectionSample3f:
@@ -108,9 +110,17 @@ class ConnectableSensor:
         return self._sensor.needs_aperture_sample()
 
     def connect(
-        self, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+        self,
+        si: mi.SurfaceInteraction3f,
+        sample: mi.Point2f,
+        active: mi.Bool,
+        clips_far: bool = True,
     ) -> tuple[SensorConnection, mi.Float | float]:
         """Connects ``si`` to a point of the aperture, which ``sample`` chooses.
+
+        Parameters:
+            clips_far: Whether points behind the far clip plane are not seen. In scenes with media,
+                camera rays pass index-matched surfaces, and have no end behind the first of them.
 
         Returns:
             The connection, and its weight (1 unless the lens prefers some points).
@@ -120,12 +130,18 @@ class ConnectableSensor:
         cosine = -dr.dot(ds.d, ds.n)
         depth = cosine * ds.dist
         inside = dr.all((ds.uv >= 0) & (ds.uv < self._size))
-        # A negative density marks points behind a thin lens
-        active = active & (ds.pdf > 0) & inside & (depth > self._near) & (depth < self._far)
+        # A negative density marks points behind a thin lens; a ``perspective`` gives the density 0
+        # to points behind the far clip plane
+        marks_behind = clips_far or self.needs_aperture_sample
+        active = active & (ds.pdf > 0) if marks_behind else active
+        active = active & inside & (depth > self._near)
+        if clips_far:
+            active &= depth < self._far
         pdf = self._inverse_area * dr.rcp(dr.select(active, cosine, 1) ** 3)
         return SensorConnection(
             ds.d, ds.dist, ds.p - ds.d * (self._near / dr.select(active, cosine, 1)),
-            ds.uv + self._offset, dr.select(active, pdf / dr.square(ds.dist), 0), active,
+            ds.uv + self._offset, dr.select(active, pdf / dr.square(ds.dist), 0),
+            (self._far - self._near) / dr.select(active, cosine, 1), active,
         ), weight  # fmt: skip
 
     def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from tests.support.fogs import (
     caustic_in_fog,
     cube,
     fog,
+    fog_around_the_camera,
     homogeneous,
 )
 from tests.support.stage import area, diffuse, lookat
@@ -95,6 +97,18 @@ def test_bdpt_has_the_image_of_volpath_in_fog(name: str) -> None:
 @pytest.mark.parametrize("name", some(of=["chromatic", "empty_cloud", "nested"]))
 def test_light_tracer_has_the_image_of_volpath_in_fog(name: str) -> None:
     compare({**SCENES, **HARD_SCENES}[name](), "light_tracer", 0.05)
+
+
+@pytest.mark.parametrize(("make_fog", "far", "name"), [
+    (fog, 6.0, "light_tracer"), (fog_around_the_camera, 3.5, "bdpt")
+])  # fmt: skip
+def test_the_far_clip_plane_ends_camera_rays_before_the_first_boundary(
+    make_fog: Callable[..., dict], far: float, name: str
+) -> None:
+    """Camera rays that pass an index-matched surface see all that is behind it."""
+    scene = make_fog("area")
+    scene["sensor"]["far_clip"] = far
+    compare(scene, name, 0.02)
 
 
 @pytest.mark.slow
