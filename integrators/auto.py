@@ -215,8 +215,8 @@ class Auto(LightPathIntegrator):
     def _least_samples(self) -> int:
         return verdicts.least_samples(device_of(mi.Float).is_gpu)
 
-    def merging_radii(self, request, side, *sums):
-        return super().merging_radii(request, side, *sums) if _can_merge(request.scene) else None
+    def merging_radius(self, request, side, *sums):
+        return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None
 
     @property
     def _most_pixels(self) -> int:

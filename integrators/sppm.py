@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from mitsuba_ext.bases.walk_integrator import WalkIntegrator
 from mitsuba_ext.estimators.light_paths.choice.light_paths import MOST_PATHS, check_shared_rays
+from mitsuba_ext.estimators.light_paths.light_media import outside_of
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import (
     MergingParameters,
     shared_numbers,
@@ -83,7 +84,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
     surface of a fog, and too bright behind a wall that is thinner than the radius. A light is taken
     to lie in the medium on its side of the closest boundary, in the direction of each photon;
     outside all boundaries, in the medium behind the last boundary that a ray from the sensor
-    crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
+    crosses. Lights at infinity are refused if that medium is not a vacuum. In camera rays through
+    homogeneous media, ``sample_emitters`` is ignored.
 
     Curves whose BSDF transmits light, such as :monosp:`hair`, are refused, because photons do not
     pass through them (use :class:`vcm`). Gradients are not supported (use :class:`composed_prb`),
@@ -136,5 +138,6 @@ class ProgressivePhotonMapping(WalkIntegrator):
             alone = Decisions(next_event=NoConnections(), query=self.query(scene))
             return OneStage(self.walk(alone))
         check_shared_rays(self.name, scene, self.light_paths)
+        outside_of(self.name, self.query(scene), scene, request.sensor)
         mapper = photon_mapper(self, request, self.merging, self.light_paths)
         return OneStage(mapper, CameraSamples(**shared_numbers(scene, request.seed)))

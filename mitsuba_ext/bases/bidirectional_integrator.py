@@ -104,10 +104,10 @@ class LightPathIntegrator(WalkIntegrator):
                 film, *film_extent(film), self.max_depth, device_of(mi.Float).pass_bytes
             )
         outside = outside_of(self.name, self.query(scene), scene, request.sensor)
-        radii = Once(functools.partial(self.merging_radii, request, side, outside))
+        radii = Once(functools.partial(self.merging_radius, request, side, outside))
         return LightPathEstimators(self, side, radii, self.techniques, outside)
 
-    def merging_radii(
+    def merging_radius(
         self,
         request: Request,
         side: LightSide,
@@ -180,7 +180,7 @@ class LightPathEstimators:
     Attributes:
         integrator: Has the parameters.
         side: The lights and the sensor.
-        radii: Within what radii vertices are merged (:meth:`LightPathIntegrator.merging_radii`).
+        radii: Within what radii vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
         images: Receives the contributions of all techniques; ``None`` if nothing does.
         outside: See :class:`LightWalk`.
     """

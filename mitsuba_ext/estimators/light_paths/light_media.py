@@ -53,8 +53,10 @@ def medium_at_start(
 def outside_of(
     plugin: str, query: SceneQuery, scene: mi.Scene, sensor: mi.Sensor
 ) -> mi.MediumPtr | None:
-    """:func:`outer_medium` of a scene whose light paths are connected; ``None`` if the scene has no
-    media.
+    """:func:`outer_medium` of a scene; ``None`` if the scene has no media.
+
+    No light from infinity would get through a medium that has no boundary. ``volpath`` lets such
+    light begin at a distance that depends on the size of the scene.
 
     Parameters:
         plugin: The plugin's name in error messages.

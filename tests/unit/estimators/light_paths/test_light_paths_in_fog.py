@@ -187,7 +187,7 @@ def test_light_does_not_leak_through_the_surface_of_glass() -> None:
 # ---- Limits ----
 
 
-@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer", "sppm"])
 def test_sky_over_fog_without_end_is_refused(name: str) -> None:
     scene = {k: v for k, v in fog("environment").items() if k != "fog"}
     scene["sensor"] = {**scene["sensor"], "medium": homogeneous(0.1)}
