@@ -157,5 +157,33 @@ def dark_room(width: int, height: int) -> Scene:
     )  # fmt: skip
 
 
+def mirrored_beam(width: int, height: int) -> Scene:
+    """A foggy room with a lamp. A ball of glass bundles the light of a smaller lamp into a beam,
+    which a mirror shows too."""
+    white, ref = _diffuse(0.6, 0.6, 0.6), {"type": "ref", "id": "around"}
+    mirror = {"type": "conductor", "material": "none"}
+    up = _t().translate([0, 0, 1.5])
+    return _foggy(
+        width, height, [-1.2, -2.6, 1.3], [0.6, 0.8, 1.2], 0.12, 10.0,
+        floor=_wall(_diffuse(0.5, 0.4, 0.3), _t().scale([2, 3, 1])),
+        ceiling=_wall(white, _t().translate([0, 0, 3]).scale([2, 3, 1])),
+        left=_wall(white, up, _t().translate([-2, 0, 0]).rotate([0, 1, 0], 90).scale([1.5, 3, 1])),
+        back=_wall(white, up, _t().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale([2, 1.5, 1])),
+        front=_wall(white, up, _t().translate([0, -3, 0]).rotate([1, 0, 0], 90).scale([2, 1.5, 1])),
+        right=_wall(mirror, up, _t().translate([2, 0, 0]).rotate([0, 1, 0], -90)
+                    .scale([1.5, 3, 1])),
+        lamp={"type": "rectangle", "emitter": _area(1.2, 1.3, 1.5),
+              "to_world": _t().translate([0, 0, 2.98]).rotate([1, 0, 0], 180).scale(0.4)},
+        small_lamp={"type": "disk", "emitter": _area(2000, 1600, 1000),
+                    "to_world": _t().look_at([-0.6, 1.2, 2.6], [0.2, 0.8, 1.7], [0, 0, 1])
+                    .scale(0.04)},
+        glass={"type": "sphere", "center": [-0.2, 1, 2.15], "radius": 0.3, "exterior": ref,
+               "bsdf": {"type": "dielectric"}},
+        # Its light leaves through the glass alone
+        shade={"type": "cylinder", "p0": [-0.62, 1.21, 2.6225], "p1": [-0.28, 1.04, 2.24],
+               "radius": 0.2, "bsdf": {"type": "twosided", "bsdf": _diffuse(0, 0, 0)}},
+    )  # fmt: skip
+
+
 #: Makes a scene with a film of the given width and height.
-FOGS = {f.__name__: f for f in (bulb, sun, soft, smoke, dark_room)}
+FOGS = {f.__name__: f for f in (bulb, sun, soft, smoke, dark_room, mirrored_beam)}

@@ -31,7 +31,7 @@ from .light_walk import LightWalk
 from .medium_programs import BidirectionalProgramInMedia, LightSumsInMedia
 from .medium_scattering import MediumTerms
 from .merging.merging import PHOTONS_PER_DISK, MergedSubpaths, disk_area
-from .merging.merging_in_media import MergedInMedia, ball_volume
+from .merging.merging_in_media import PHOTONS_PER_SAMPLE, MergedInMedia, ball_volume
 from .merging.merging_radius import MergingRadii
 from .merging.vertex_grid import VertexGrid, all_of
 from .partial_sums import PartialSums
@@ -118,10 +118,14 @@ class BidirectionalPathTracer:
             # If times or wavelengths differ, paths merge only with the same sample of other pixels
             paths = min(lanes, self.radii.pixels) if own_lane else light.count
             disk, ball = self._next_radii(paths, light.count // paths)
-            share = dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
-            merging = mi.Float(0) if disk is None else disk_area(disk) * share
+            merging = mi.Float(0)
+            if disk is not None:
+                merging = disk_area(disk) * dr.opaque(mi.Float, paths / PHOTONS_PER_DISK)
             if in_media:
-                merging_in_media = mi.Float(0) if ball is None else ball_volume(ball) * share
+                merging_in_media = mi.Float(0)
+            if ball is not None:
+                share = dr.opaque(mi.Float, paths / PHOTONS_PER_SAMPLE)
+                merging_in_media = ball_volume(ball) * share
         sums = PartialSums(
             dr.opaque(mi.Float, count), splits=splits, selection=selection, merging=merging,
             merges_all=self.merges_all, light_paths=dr.opaque(mi.Float, per_camera_path),

@@ -30,6 +30,11 @@ from .merging import (
 )
 from .vertex_grid import Kept, VertexCounts
 
+#: The number of photons in a ball that MIS weights count as one sample. (It is larger than on
+#: surfaces, because few camera paths scatter in a beam of light, and these meet many photons there.
+#: Variance with 8, 24 and 80: mirrored_beam 0.097, 0.063, 0.049; volume_caustic 0.37, 0.39, 0.53.)
+PHOTONS_PER_SAMPLE = 24.0
+
 #: The largest radius of a ball, in footprints of pixels.
 _WIDEST_BALL = 20.0
 
