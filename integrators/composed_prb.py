@@ -14,10 +14,16 @@ from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.loss_samples import LossSamples
 from mitsuba_ext.rendering.turns import in_turn
-from mitsuba_ext.scene.gradients import optimized_but_smooth, optimizes_grids, refuse_geometry
+from mitsuba_ext.scene.gradients import (
+    optimized_but_smooth,
+    optimized_roughness,
+    optimizes_grids,
+    refuse_geometry,
+)
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.mirrored_directions import MirroredDirections, PairedNumbers
 from mitsuba_ext.transport.replay import FirstPass, Replay
 
 # Mitsuba executes this module again for each variant, but perhaps not yet for this one
@@ -153,6 +159,7 @@ class ComposedPRB(common.RBIntegrator):
         self.rr_depth = self.path.rr_depth
         self._pixel_count, self._medium, self._fills_gaps = 1, None, False
         self._optimized: frozenset[str] = frozenset()
+        self._roughness: mi.UInt32 | None = None
 
     @property
     def statistics(self):
@@ -226,6 +233,7 @@ class ComposedPRB(common.RBIntegrator):
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
         self._fills_gaps = optimizes_grids(scene)
+        self._roughness = optimized_roughness(scene)
 
     def _tell_of_zeros(self, scene, params) -> None:
         """Warns of gradients that are always 0, once for each set of parameters."""
@@ -244,7 +252,10 @@ class ComposedPRB(common.RBIntegrator):
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
         self._pixel_count, self._medium = width * height, sensor.get_medium()
-        return super().prepare(sensor, seed, spp, list(aovs))
+        sampler, spp = super().prepare(sensor, seed, spp, list(aovs))
+        if self._roughness is not None:
+            sampler = PairedNumbers.begin(sampler, seed)
+        return sampler, spp
 
     def sample(
         self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, pixel=None, **_others
@@ -254,6 +265,9 @@ class ComposedPRB(common.RBIntegrator):
             pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
         rays = CameraRays(ray, pixel, medium=self._medium)
         walk = self._for_gradients.remembered(scene)
+        if self._roughness is not None:
+            directions = MirroredDirections(walk.directions, self._roughness)
+            walk = replace(walk, directions=directions)
         if mode == dr.ADMode.Primal:
             first = FirstPass(self._fills_gaps) if may_have_media(scene) else None
             sample = replace(walk, replay=first)(scene, sampler, rays, mi.Bool(active))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,15 @@ from .parameter_values import values_of
 _GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "control_points", "x_fov",
              "principal_point_offset_x", "principal_point_offset_y", "aperture_radius",
              "focus_distance")  # fmt: skip
+
+#: Names of the roughness of microfacet BSDFs.
+_ROUGHNESS = {"alpha", "alpha_u", "alpha_v", "roughness"}
+
+
+class Distribution(enum.IntEnum):
+    """How the normals of the microfacets of a BSDF are distributed."""
+
+    NONE, GGX, BECKMANN = range(3)
 
 
 def refuse_geometry(plugin: str, params: Any) -> None:
@@ -63,6 +73,34 @@ def optimized_but_smooth(scene: mi.Scene) -> list[str]:
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
         and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         and _is_optimized(bsdf)
+    )
+
+
+def optimized_roughness(scene: mi.Scene) -> mi.UInt32 | None:
+    """The :class:`Distribution` of the microfacets of each BSDF whose roughness has gradients, and
+    that samples visible normals: a table over Dr.Jit's indices of BSDFs. ``None`` if there is no
+    such BSDF. BSDFs within instances are not accessible."""
+    found = {}
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None and _has_optimized_roughness(bsdf):
+            # Of BSDFs that contain others, too
+            described = str(bsdf)
+            is_beckmann = "distribution = beckmann" in described
+            if "sample_visible = 0" not in described:
+                kind = Distribution.BECKMANN if is_beckmann else Distribution.GGX
+                found[_index(mi.BSDFPtr(bsdf))] = kind
+    if not found:
+        return None
+    table = np.zeros(max(found) + 1, np.uint32)
+    table[[*found]] = [*found.values()]
+    return mi.UInt32(table)
+
+
+def _has_optimized_roughness(bsdf: mi.BSDF) -> bool:
+    return any(
+        _ROUGHNESS & set(key.split(".")) and dr.grad_enabled(value)
+        for key, value in values_of(mi.traverse(bsdf))
     )
 
 
