@@ -15,8 +15,8 @@ from mitsuba_ext.rendering.camera import film_extent, find_sensor
 from mitsuba_ext.rendering.loss_samples import LossSamples
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import (
+    RoughBSDFs,
     optimized_but_smooth,
-    optimized_roughness,
     optimizes_grids,
     refuse_geometry,
 )
@@ -159,7 +159,7 @@ class ComposedPRB(common.RBIntegrator):
         self.rr_depth = self.path.rr_depth
         self._pixel_count, self._medium, self._fills_gaps = 1, None, False
         self._optimized: frozenset[str] = frozenset()
-        self._roughness: mi.UInt32 | None = None
+        self._rough: RoughBSDFs | None = None
 
     @property
     def statistics(self):
@@ -233,7 +233,7 @@ class ComposedPRB(common.RBIntegrator):
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
         self._fills_gaps = optimizes_grids(scene)
-        self._roughness = optimized_roughness(scene)
+        self._rough = RoughBSDFs.of(scene)
 
     def _tell_of_zeros(self, scene, params) -> None:
         """Warns of gradients that are always 0, once for each set of parameters."""
@@ -253,7 +253,7 @@ class ComposedPRB(common.RBIntegrator):
         width, height = film_extent(sensor.film())
         self._pixel_count, self._medium = width * height, sensor.get_medium()
         sampler, spp = super().prepare(sensor, seed, spp, list(aovs))
-        if self._roughness is not None:
+        if self._rough is not None:
             sampler = PairedNumbers.begin(sampler, seed)
         return sampler, spp
 
@@ -265,8 +265,8 @@ class ComposedPRB(common.RBIntegrator):
             pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
         rays = CameraRays(ray, pixel, medium=self._medium)
         walk = self._for_gradients.remembered(scene)
-        if self._roughness is not None:
-            directions = MirroredDirections(walk.directions, self._roughness)
+        if self._rough is not None:
+            directions = MirroredDirections(walk.directions, self._rough)
             walk = replace(walk, directions=directions)
         if mode == dr.ADMode.Primal:
             first = FirstPass(self._fills_gaps) if may_have_media(scene) else None

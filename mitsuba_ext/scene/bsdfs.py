@@ -71,7 +71,7 @@ def undivided_bsdfs(scene: mi.Scene) -> mi.Float | None:
     """For BSDFs that are, or contain, a ``principled`` or ``principledthin``: the weight of its
     diffuse lobes (the mean over a texture). It is a table over Dr.Jit's indices of BSDFs, negative
     for other BSDFs; ``None`` if there are only others."""
-    weights = {_index(b): _diffuse_weight(b) for b in _bsdfs(scene) if contains_bsdf(b, _UNDIVIDED)}
+    weights = {_index(b): diffuse_weight(b) for b in _bsdfs(scene) if contains_bsdf(b, _UNDIVIDED)}
     if not weights:
         return None
     table = np.full(max(weights) + 1, -1.0)
@@ -79,8 +79,8 @@ def undivided_bsdfs(scene: mi.Scene) -> mi.Float | None:
     return from_numpy(mi.Float, table)
 
 
-def _diffuse_weight(bsdf: mi.BSDF) -> float:
-    """(1 − metallic) (1 − spec_trans), by the names of the parameters."""
+def diffuse_weight(bsdf: mi.BSDF) -> float:
+    """(1 − metallic) (1 − spec_trans), by the names of the parameters; 1 for BSDFs without them."""
     weight, parameters = 1.0, mi.traverse(bsdf)
     for key in parameters.keys():
         if {"metallic", "spec_trans"} & set(key.split(".")):

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bsdfs import diffuse_weight
 from .media import scene_media
 from .parameter_values import values_of
 
@@ -76,32 +77,65 @@ def optimized_but_smooth(scene: mi.Scene) -> list[str]:
     )
 
 
-def optimized_roughness(scene: mi.Scene) -> mi.UInt32 | None:
-    """The :class:`Distribution` of the microfacets of each BSDF whose roughness has gradients, and
-    that samples visible normals: a table over Dr.Jit's indices of BSDFs. ``None`` if there is no
-    such BSDF. BSDFs within instances are not accessible."""
-    found = {}
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is not None and _has_optimized_roughness(bsdf):
-            # Of BSDFs that contain others, too
-            described = str(bsdf)
-            is_beckmann = "distribution = beckmann" in described
-            if "sample_visible = 0" not in described:
+class RoughBSDFs:
+    """The BSDFs of a scene whose roughness has gradients, that sample visible normals, and most of
+    whose samples do: not those of ``roughplastic`` and others with strong diffuse lobes. BSDFs
+    within instances are not accessible.
+
+    Attributes:
+        kinds: The :class:`Distribution` of the microfacets of each BSDF, and ``NONE`` for other
+            BSDFs; a table over Dr.Jit's indices of BSDFs.
+        α: The roughness of each BSDF: of textures, the mean; of several lobes, the largest.
+    """
+
+    def __init__(self, found: dict[int, tuple[Distribution, float]]) -> None:
+        kinds, α = (np.zeros(max(found) + 1, kind) for kind in (np.uint32, np.float32))
+        for index, values in found.items():
+            kinds[index], α[index] = values
+        self.kinds, self.α = mi.UInt32(kinds), mi.Float(α)
+        self._used = {kind for kind, _ in found.values()}
+
+    @classmethod
+    def of(cls, scene: mi.Scene) -> RoughBSDFs | None:
+        """Those of ``scene``; ``None`` if there are none."""
+        found = {}
+        for shape in scene.shapes():
+            bsdf = shape.bsdf()
+            α = 0.0 if bsdf is None or _is_diffuse(bsdf) else _optimized_roughness(bsdf)
+            described = str(bsdf)  # with BSDFs that are nested
+            if α > 0 and "sample_visible = 0" not in described:
+                is_beckmann = "distribution = beckmann" in described
                 kind = Distribution.BECKMANN if is_beckmann else Distribution.GGX
-                found[_index(mi.BSDFPtr(bsdf))] = kind
-    if not found:
-        return None
-    table = np.zeros(max(found) + 1, np.uint32)
-    table[[*found]] = [*found.values()]
-    return mi.UInt32(table)
+                found[_index(mi.BSDFPtr(bsdf))] = kind, α
+        return cls(found) if found else None
+
+    def at(self, bsdf: mi.BSDFPtr) -> tuple[mi.UInt32, mi.Float]:
+        """The kind and the roughness of ``bsdf``."""
+        index = dr.reinterpret_array(mi.UInt32, bsdf)
+        is_known = index < dr.width(self.kinds)
+        return (
+            dr.gather(mi.UInt32, self.kinds, index, is_known),
+            dr.gather(mi.Float, self.α, index, is_known),
+        )
+
+    def has(self, kind: Distribution) -> bool:
+        """Whether any of the BSDFs is of this ``kind``."""
+        return kind in self._used
 
 
-def _has_optimized_roughness(bsdf: mi.BSDF) -> bool:
-    return any(
-        _ROUGHNESS & set(key.split(".")) and dr.grad_enabled(value)
-        for key, value in values_of(mi.traverse(bsdf))
-    )
+def _is_diffuse(bsdf: mi.BSDF) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse) and diffuse_weight(bsdf) > 0.5
+
+
+def _optimized_roughness(bsdf: mi.BSDF) -> float:
+    """The largest α that has gradients; 0 if none has."""
+    largest, parameters = 0.0, mi.traverse(bsdf)
+    for key, value in values_of(parameters):
+        names = _ROUGHNESS & set(key.split("."))
+        if names and dr.grad_enabled(value):
+            mean = float(np.mean(np.array(dr.detach(value), np.float64)))
+            largest = max(largest, mean**2 if "roughness" in names else mean)
+    return largest
 
 
 class Optimized:

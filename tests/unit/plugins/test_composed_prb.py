@@ -103,10 +103,10 @@ def keys_of(parameters: mi.SceneParameters) -> list[str]:
 
 @pytest.mark.parametrize("more", [{}, {"hide_emitters": True}], ids=str)
 def test_with_all_defaults_gradients_agree_with_prb(more: dict[str, Any]) -> None:
-    """They use the same random numbers."""
+    """They use the same random numbers, unless a roughness is optimized."""
     scene = room()
     parameters = small(scene)
-    keys = keys_of(parameters)
+    keys = [key for key in keys_of(parameters) if "alpha" not in key]
     ours, theirs = (
         backward(scene, parameters, keys, make(name, **more), 3, 64)
         for name in ("composed_prb", "prb")
