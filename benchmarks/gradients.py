@@ -10,6 +10,7 @@ squared``, by the derivative of a squared error that was measured with 16 sample
 ``--loss masked``, by random numbers in the middle quarter of the image alone. Its gradients are
 those with respect to all colours, roughnesses and emissions of the scene that are no textures, and
 to the albedo and extinction of media;
+with ``--roughness``, with respect to roughnesses alone;
 with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
 over the renders but the first two, of the image and its gradients, of all cores; learning included.
@@ -35,6 +36,8 @@ from mitsuba_ext.scene.media import has_media  # isort: skip
 
 _ENDS = ("reflectance.value", "radiance.value", "alpha.value", "albedo.value.value",
          "sigma_t.value.value")  # fmt: skip
+
+_ROUGHNESS = ("alpha", "alpha.value", "roughness.value")
 
 #: The first one, in scenes with media the second, is that to which the others are compared.
 INTEGRATORS = {
@@ -92,15 +95,18 @@ def load(
 @click.option(
     "--loss", default="even", show_default=True, type=click.Choice(["even", "squared", "masked"])
 )
+@click.option("--roughness", is_flag=True, help="Only of roughness.")
 @click.option("--lamps", default=0, help="Of so many lamps, each on its own, in scenes with more.")
 def main(
-    files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], loss: str, lamps: int
-) -> None:
+    files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], loss: str,
+    roughness: bool, lamps: int,
+) -> None:  # fmt: skip
     """Compares on the scenes FILES."""
     mi.set_variant("llvm_ad_rgb")
     for file in files:
         scene, parameters, weights = load(file, size, loss)
-        keys = [key for key in parameters.keys() if key.endswith(_ENDS)]
+        ends = _ROUGHNESS if roughness else _ENDS
+        keys = [key for key in parameters.keys() if key.endswith(ends)]
         sets = [keys]
         if lamps:
             all_lamps = [[key] for key in keys if key.endswith("radiance.value")]
