@@ -107,8 +107,16 @@ class ComposedPRB(common.RBIntegrator):
     The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
     that the path has gathered so far, so the rest of its radiance is known. All densities, MIS
-    weights and learned maps are treated as constants. With all defaults, gradients are the same as
-    with :monosp:`prb`, from the same random numbers up to :monosp:`rr_depth`.
+    weights and learned maps are treated as constants. With all defaults, and except with respect to
+    roughness, gradients are the same as with :monosp:`prb`, from the same random numbers up to
+    :monosp:`rr_depth`.
+
+    If the roughness of a conductor, a dielectric or a metallic :monosp:`principled` is optimized,
+    samples form pairs where a camera ray meets it, if it is not very rough and not seen at a
+    grazing angle. The two samples of a pair see the opposite parts of the derivative of its lobe,
+    so that they cancel where light is uniform. Use an even number of samples per pixel.
+    Gradients of :monosp:`roughplastic`, of BSDFs without :monosp:`sample_visible`, and within
+    instances have no pairs.
 
     In media, the camera may be in fog, and extinctions may be coloured. The extinction of a grid
     has unbiased gradients where the grid is empty, too: some paths scatter there for derivatives
@@ -124,7 +132,11 @@ class ComposedPRB(common.RBIntegrator):
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
     Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021; for
     empty regions of grids: M. Nimier-David, T. Müller, A. Keller, W. Jakob, *Unbiased Inverse
-    Volume Rendering with Differential Trackers*, ACM Transactions on Graphics 41(4), 2022.
+    Volume Rendering with Differential Trackers*, ACM Transactions on Graphics 41(4), 2022; for
+    roughness: Y. Belhe, B. Xu, S. P. Bangaru, R. Ramamoorthi, T.-M. Li, *Importance Sampling BRDF
+    Derivatives*, ACM Transactions on Graphics 43(3), 2024, and C. Zhang, Z. Dong, M. Doggett, S.
+    Zhao, *Antithetic Sampling for Monte Carlo Differentiable Rendering*, ACM Transactions on
+    Graphics 40(4), 2021.
 
     .. tabs::
         .. code-tab:: xml

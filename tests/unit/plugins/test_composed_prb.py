@@ -325,12 +325,13 @@ def test_gradients_of_another_scene_in_memory_refuse_no_render() -> None:
     assert plain.render(other, spp=1).numpy().mean() > 0
 
 
-def test_decisions_without_gradients_are_refused() -> None:
+@pytest.mark.parametrize("end", ["floor.to_world", "vertex_positions", "vertex_texcoords"])
+def test_geometry_and_decisions_without_gradients_are_refused(end: str) -> None:
     scene = mi.load_dict(stage(), optimize=False)
     parameters = small(scene)
-    key = next(key for key in parameters.keys() if key.endswith("to_world"))
+    key = next(key for key in parameters.keys() if key.endswith(end))
     with pytest.raises(RuntimeError) as error:
-        dr.enable_grad(parameters[key].matrix)
+        dr.enable_grad(getattr(parameters[key], "matrix", parameters[key]))
         parameters.update()
         image = mi.render(scene, parameters, integrator=make(), spp=1)
         dr.backward(dr.mean(image, axis=None))

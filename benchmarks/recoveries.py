@@ -1,0 +1,217 @@
+"""Whole optimizations, eight of them: how long do ``prb`` and the recommended integrator take?
+
+    python benchmarks/recoveries.py --seconds 10
+
+Each task recovers parameters of a scene from one picture of it, by Adam: colours, lamps, a
+painting, roughness, an environment map, fog. Both integrators take as many samples, have the same
+learning rate, which is one for all tasks of a kind, and get the same processor time (of all cores;
+compilation and learning included).
+
+Error: the mean over the parameters, of their difference to the true ones (of their logarithms for
+lamps, roughness and fog), after the best of the learning rates. Speed: how much earlier the
+recommended integrator reaches the larger of the two final errors, a running mean over a tenth of
+the steps; below 1 if ``prb`` is the faster one.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+import numpy as np  # isort: skip
+
+SCENES = Path(__file__).parents[1] / "scenes"
+
+#: What we recommend: learned lights, samples where the loss is, and a control variate.
+RECOMMENDED = {
+    "type": "control_variate",
+    "nested": {
+        "type": "composed_prb", "max_depth": 6,
+        "next_event": "contribution", "gradient_samples": "loss",
+    },
+}  # fmt: skip
+
+
+@dataclass
+class Task:
+    """What is recovered.
+
+    Attributes:
+        scene: Name of the scene.
+        ends: The ends of the names of its parameters.
+        start: Their values at the beginning; for logarithms, a factor of the true ones.
+        is_logarithm: Whether their logarithms are optimized.
+        spp: Samples per pixel of a step.
+    """
+
+    scene: str
+    ends: tuple[str, ...]
+    start: float = 0.4
+    is_logarithm: bool = False
+    spp: int = 2
+
+
+TASKS = {
+    "rooms, 20 colours": Task("rooms", ("reflectance.value",)),
+    "cornell_box, 5 colours": Task("cornell_box", ("reflectance.value",)),
+    "corridor, 7 colours": Task("corridor", ("reflectance.value",)),
+    "rooms, 24 lamps": Task("rooms", ("radiance.value",), 2.0, True),
+    "door_ajar, a painting": Task("door_ajar", ("reflectance.data",), 0.5, False, 4),
+    "sunny_gloss, roughness": Task("sunny_gloss", ("alpha", "alpha.value"), 2.0, True, 4),
+    "cornell_box, 16x8 sky": Task("sky", ("sky.data",), 0.5, False, 4),
+    "cornell_box, fog": Task("fog", ("albedo.value.value", "sigma_t.value.value"), 2.0, True, 4),
+}
+
+
+def load(name: str, size: tuple[int, int]) -> mi.Scene:
+    """A scene of the folder, or ``sky`` or ``fog``, with a film of this size."""
+    if name in ("sky", "fog"):
+        scene = mi.load_dict(_box(name), optimize=False)
+    else:
+        scene = mi.load_file(str(SCENES / f"{name}.xml"))
+    sensor = mi.traverse(scene.sensors()[0])
+    sensor["film.size"] = sensor["film.crop_size"] = list(size)
+    sensor.update()
+    return scene
+
+
+def _box(name: str) -> dict:
+    box = mi.cornell_box()
+    del box["integrator"]
+    if name == "sky":
+        del box["light"], box["ceiling"]
+        sky = np.random.default_rng(1).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
+        box["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(sky)}
+    else:
+        medium = {
+            "type": "homogeneous", "sigma_t": 1.5,
+            "albedo": {"type": "rgb", "value": [0.8, 0.6, 0.4]},
+        }  # fmt: skip
+        box["ball"] = {
+            "type": "sphere", "center": [0.1, -0.1, 0.35], "radius": 0.45,
+            "bsdf": {"type": "null"}, "interior": medium,
+        }  # fmt: skip
+    return box
+
+
+class Recovery:
+    """A task with its scene and its picture."""
+
+    def __init__(self, task: Task, size: tuple[int, int]) -> None:
+        self.task, self.scene = task, load(task.scene, size)
+        plugin = "volpath" if task.scene == "fog" else "path"
+        reference = mi.load_dict({"type": plugin, "max_depth": 6})
+        self.target = mi.render(self.scene, integrator=reference, spp=1024, seed=10**6)
+        self.parameters = mi.traverse(self.scene)
+        self.truth = {
+            key: type(value)(value) for key, value in self.parameters
+            if key.endswith(task.ends) and dr.is_diff_v(value)
+        }  # fmt: skip
+        dr.eval(self.target, self.truth)
+
+    def run(self, plugin: dict, seconds: float, rate: float, seed: int) -> list[tuple]:
+        """The time after each step, and the error."""
+        task, integrator = self.task, mi.load_dict(plugin)
+        optimizer, steps, spent = mi.ad.Adam(lr=rate), [], 0.0
+        for key, value in self.truth.items():
+            kind = type(value)
+            if task.is_logarithm:
+                optimizer[key] = kind(dr.log(value * task.start))
+            else:
+                optimizer[key] = kind(value * 0 + task.start)
+        while spent < seconds:
+            begin = time.process_time()
+            for key in self.truth:
+                self.parameters[key] = self._values(optimizer, key)
+            self.parameters.update()
+            image = mi.render(
+                self.scene, self.parameters, integrator=integrator, seed=seed, spp=task.spp
+            )
+            loss = dr.mean(dr.square((image - self.target) / (self.target + 0.01)), axis=None)
+            dr.backward(loss)
+            optimizer.step()
+            if not task.is_logarithm:
+                for key in self.truth:
+                    optimizer[key] = dr.clip(optimizer[key], 0.01, 0.99)
+            dr.eval(optimizer)
+            dr.sync_thread()
+            spent += time.process_time() - begin
+            steps.append((spent, self._error(optimizer)))
+            seed += 1
+        for key, value in self.truth.items():
+            self.parameters[key] = value
+        self.parameters.update()
+        return steps
+
+    def _values(self, optimizer: mi.ad.Adam, key: str):
+        if not self.task.is_logarithm:
+            return optimizer[key]
+        value = dr.exp(optimizer[key])
+        return dr.minimum(value, 0.99) if "albedo" in key else value
+
+    def _error(self, optimizer: mi.ad.Adam) -> float:
+        errors = []
+        for key, truth in self.truth.items():
+            found = np.array(dr.detach(self._values(optimizer, key)))
+            truth = np.array(truth)
+            if self.task.is_logarithm:
+                found, truth = np.log(found), np.log(truth)
+            errors.append(np.abs(found - truth).mean())
+        return float(np.mean(errors))
+
+
+def smoothed(steps: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
+    """The times, and a running mean of the errors."""
+    times, errors = np.array(steps).T
+    width = max(1, len(errors) // 10)
+    sums = np.cumsum(np.concatenate([np.full(width, errors[0]), errors]))
+    return times, (sums[width:] - sums[:-width]) / width
+
+
+def speed(ours: list[tuple], theirs: list[tuple]) -> float:
+    """How much earlier ``ours`` reaches the larger of the two final errors."""
+    curves = [smoothed(each) for each in (ours, theirs)]
+    level = max(errors[-1] for _, errors in curves)
+    first, second = (times[np.argmax(errors <= level)] for times, errors in curves)
+    return float(second / first)
+
+
+@click.command()
+@click.option("--seconds", default=10.0, show_default=True, help="Of each optimization.")
+@click.option("--size", default=(64, 36), type=(int, int), show_default=True)
+@click.option("--rate", "rates", multiple=True, default=(0.02,), show_default=True, type=float)
+@click.option("--only", default="", help="Tasks whose names contain this.")
+def main(seconds: float, size: tuple[int, int], rates: tuple[float, ...], only: str) -> None:
+    """Runs the tasks with each integrator and each learning rate."""
+    mi.set_variant("llvm_ad_rgb")
+    speeds = []
+    for name, task in TASKS.items():
+        if only not in name:
+            continue
+        recovery = Recovery(task, size)
+        base = {"type": "prbvolpath" if task.scene == "fog" else "prb", "max_depth": 6}
+        best = []
+        for plugin in (base, RECOMMENDED):
+            runs = [recovery.run(plugin, seconds, rate, 1) for rate in rates]
+            best.append(min(runs, key=lambda steps: smoothed(steps)[1][-1]))
+        theirs, ours = best
+        speeds.append(speed(ours, theirs))
+        print(
+            f"{name}: error {theirs[0][1]:.3f} -> prb {smoothed(theirs)[1][-1]:.4f} "
+            f"({len(theirs)} steps), ours {smoothed(ours)[1][-1]:.4f} ({len(ours)}); "
+            f"speed {speeds[-1]:.2f}",
+            flush=True,
+        )
+    print(f"geometric mean {np.exp(np.mean(np.log(speeds))):.2f}, least {min(speeds):.2f}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
