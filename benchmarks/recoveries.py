@@ -1,21 +1,20 @@
-"""Whole optimizations, eight of them: how long do ``prb`` and the recommended integrator take?
+"""Whole optimizations, eight of them: how long do they take, compared with ``prb``?
 
     python benchmarks/recoveries.py --seconds 10
 
 Each task recovers parameters of a scene from one picture of it, by Adam: colours, lamps, a
-painting, roughness, an environment map, fog. Both integrators take as many samples, have the same
-learning rate, which is one for all tasks of a kind, and get the same processor time (of all cores;
-compilation and learning included).
+painting, roughness, an environment map, fog. All integrators take as many samples, have the same
+learning rates, and get the same processor time (of all cores; compilation and learning included).
+In fog, ``prbvolpath`` stands for ``prb``.
 
 Error: the mean over the parameters, of their difference to the true ones (of their logarithms for
-lamps, roughness and fog), after the best of the learning rates. Speed: how much earlier the
-recommended integrator reaches the larger of the two final errors, a running mean over a tenth of
-the steps; below 1 if ``prb`` is the faster one.
+lamps, roughness and fog), with the best of the learning rates. Speed: how much earlier an
+integrator reaches the larger of its own final error and the final error of ``prb``, as running
+means over a tenth of the steps; below 1 if ``prb`` is the faster one.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +29,13 @@ import numpy as np  # isort: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
-#: What we recommend: learned lights, samples where the loss is, and a control variate.
-RECOMMENDED = {
-    "type": "control_variate",
-    "nested": {
-        "type": "composed_prb", "max_depth": 6,
-        "next_event": "contribution", "gradient_samples": "loss",
+_COMPOSED = {"type": "composed_prb", "max_depth": 6, "next_event": "contribution"}
+
+#: What is compared with ``prb``.
+INTEGRATORS = {
+    "composed_prb": _COMPOSED,
+    "control_variate": {
+        "type": "control_variate", "nested": {**_COMPOSED, "gradient_samples": "loss"}
     },
 }  # fmt: skip
 
@@ -151,6 +151,11 @@ class Recovery:
         self.parameters.update()
         return steps
 
+    def best(self, plugin: dict, seconds: float, rates: tuple[float, ...]) -> list[tuple]:
+        """The run with the best of the learning rates."""
+        runs = [self.run(plugin, seconds, rate, 1) for rate in rates]
+        return min(runs, key=lambda steps: smoothed(steps)[1][-1])
+
     def _values(self, optimizer: mi.ad.Adam, key: str):
         if not self.task.is_logarithm:
             return optimizer[key]
@@ -176,6 +181,11 @@ def smoothed(steps: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
     return times, (sums[width:] - sums[:-width]) / width
 
 
+def described(steps: list[tuple]) -> str:
+    """The error at the end, and the number of steps."""
+    return f"{smoothed(steps)[1][-1]:.4f} ({len(steps)} steps)"
+
+
 def speed(ours: list[tuple], theirs: list[tuple]) -> float:
     """How much earlier ``ours`` reaches the larger of the two final errors."""
     curves = [smoothed(each) for each in (ours, theirs)]
@@ -189,29 +199,31 @@ def speed(ours: list[tuple], theirs: list[tuple]) -> float:
 @click.option("--size", default=(64, 36), type=(int, int), show_default=True)
 @click.option("--rate", "rates", multiple=True, default=(0.02,), show_default=True, type=float)
 @click.option("--only", default="", help="Tasks whose names contain this.")
-def main(seconds: float, size: tuple[int, int], rates: tuple[float, ...], only: str) -> None:
+@click.option("--against", "names", multiple=True, default=tuple(INTEGRATORS), show_default=True,
+              type=click.Choice(list(INTEGRATORS)))
+def main(
+    seconds: float, size: tuple[int, int], rates: tuple[float, ...], only: str,
+    names: tuple[str, ...],
+) -> None:  # fmt: skip
     """Runs the tasks with each integrator and each learning rate."""
     mi.set_variant("llvm_ad_rgb")
-    speeds = []
+    speeds: dict[str, list[float]] = {name: [] for name in names}
     for name, task in TASKS.items():
         if only not in name:
             continue
         recovery = Recovery(task, size)
         base = {"type": "prbvolpath" if task.scene == "fog" else "prb", "max_depth": 6}
-        best = []
-        for plugin in (base, RECOMMENDED):
-            runs = [recovery.run(plugin, seconds, rate, 1) for rate in rates]
-            best.append(min(runs, key=lambda steps: smoothed(steps)[1][-1]))
-        theirs, ours = best
-        speeds.append(speed(ours, theirs))
-        print(
-            f"{name}: error {theirs[0][1]:.3f} -> prb {smoothed(theirs)[1][-1]:.4f} "
-            f"({len(theirs)} steps), ours {smoothed(ours)[1][-1]:.4f} ({len(ours)}); "
-            f"speed {speeds[-1]:.2f}",
-            flush=True,
-        )
-    print(f"geometric mean {np.exp(np.mean(np.log(speeds))):.2f}, least {min(speeds):.2f}")
+        theirs = recovery.best(base, seconds, rates)
+        print(f"{name}: error {theirs[0][1]:.3f} -> prb {described(theirs)}", end="", flush=True)
+        for each in names:
+            ours = recovery.best(INTEGRATORS[each], seconds, rates)
+            speeds[each].append(speed(ours, theirs))
+            print(f"; {each} {described(ours)}, speed {speeds[each][-1]:.2f}", end="", flush=True)
+        print()
+    for each, values in speeds.items():
+        mean = np.exp(np.mean(np.log(values)))
+        print(f"{each}: geometric mean {mean:.2f}, least {min(values):.2f}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

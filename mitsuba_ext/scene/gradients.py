@@ -15,9 +15,9 @@ from .media import scene_media
 from .parameter_values import values_of
 
 #: Parameters of shapes and sensors that change where rays hit.
-_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "control_points", "x_fov",
-             "principal_point_offset_x", "principal_point_offset_y", "aperture_radius",
-             "focus_distance")  # fmt: skip
+_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world",
+             "control_points", "x_fov", "principal_point_offset_x", "principal_point_offset_y",
+             "aperture_radius", "focus_distance")  # fmt: skip
 
 #: Names of the roughness of microfacet BSDFs.
 _ROUGHNESS = {"alpha", "alpha_u", "alpha_v", "roughness"}
