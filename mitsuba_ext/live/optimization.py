@@ -41,8 +41,8 @@ class OptimizationProgress:
 
     *Noise* is the standard deviation of the gradients between steps, divided by their mean, over
     about ten steps and all elements of all parameters (the root of the sum of the squares of each).
-    Above 1, a step has more noise than gradient: more samples, a smaller learning rate, or
-    ``control_variate`` may help.
+    Above 1, a step has more noise than gradient, as always near the optimum, where gradients
+    vanish. Before, more samples, a smaller learning rate, or ``control_variate`` may help.
 
     Parameters:
         optimizer: The optimizer, such as ``mi.ad.Adam``, with its parameters.
