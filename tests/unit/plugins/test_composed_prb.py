@@ -325,7 +325,7 @@ def test_gradients_of_another_scene_in_memory_refuse_no_render() -> None:
     assert plain.render(other, spp=1).numpy().mean() > 0
 
 
-@pytest.mark.parametrize("end", ["floor.to_world", "vertex_positions", "vertex_texcoords"])
+@pytest.mark.parametrize("end", ["floor.to_world", "vertex_texcoords"])
 def test_geometry_and_decisions_without_gradients_are_refused(end: str) -> None:
     scene = mi.load_dict(stage(), optimize=False)
     parameters = small(scene)

@@ -9,7 +9,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.transport.mirrored_directions import mirrored_beckmann, mirrored_ggx
+from mitsuba_ext.scene.gradients import RoughBSDFs
+from mitsuba_ext.transport.mirrored_directions import (
+    MirroredDirections,
+    PairedNumbers,
+    mirrored_beckmann,
+    mirrored_ggx,
+)
+from mitsuba_ext.transport.path_decisions import DirectionSamples
+from mitsuba_ext.transport.vertex import PathState, Vertex
 from tests.support.stage import bitmap, film, rgb, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -91,6 +99,30 @@ def ball(kind: str, **parameters: Any) -> mi.Scene:
         {"type": "scene", "sensor": sensor(film=film(24, 24)), "sky": SKY, "ball": shape},
         optimize=False,
     )
+
+
+def test_the_second_of_two_lanes_has_the_mirrored_numbers_and_their_weight() -> None:
+    scene = ball("roughconductor", alpha=0.1)
+    known = mi.traverse(scene)
+    dr.enable_grad(known["ball.bsdf.alpha.value"])
+    known.update()
+    decision = MirroredDirections(DirectionSamples(), RoughBSDFs.of(scene))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, 64)
+    numbers = PairedNumbers.begin(sampler, 5)
+    si = dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.wi = mi.Vector3f(0, 0, 1)
+    # Half of the lanes arrive at a grazing angle, where there are no pairs
+    si.wi[dr.arange(mi.UInt32, 64) >= 32] = mi.Vector3f(0.99, 0, 0.14)
+    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), None, None)
+    vertex = Vertex(si, mi.BSDFPtr(scene.shapes()[0].bsdf()), path)
+    sample_1, sample_2, weight, _ = decision.draw(None, numbers, vertex, mi.Bool(True))
+    choice, u, weight = sample_1.numpy(), sample_2.numpy(), weight.numpy()
+    mirrored, stretch = mirrored_beckmann(mi.Point2f(u[:, :32:2]), mi.Bool(True))
+    np.testing.assert_allclose(u[:, 1:32:2], mirrored.numpy(), atol=1e-5)
+    np.testing.assert_allclose(weight[1:32:2], stretch.numpy(), rtol=1e-3)
+    assert (choice[1:32:2] == choice[:32:2]).all() and (choice[33::2] != choice[32::2]).all()
+    assert (weight[::2] == 1).all() and (weight[32:] == 1).all()
 
 
 @pytest.mark.parametrize(
