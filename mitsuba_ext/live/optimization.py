@@ -113,7 +113,8 @@ class OptimizationProgress:
             axis.set_title("noise of the gradients" if name == "noise" else name)
             axis.set_xlabel("step")
         for axis, name, image in zip(axes[2:], ("first image", "last image"), images):
-            axis.imshow(np.array(mi.util.convert_to_bitmap(image)))
+            colours = image[..., :3] if image.shape[-1] > 3 else image  # the rest is no colour
+            axis.imshow(np.squeeze(np.array(mi.util.convert_to_bitmap(colours))), cmap="gray")
             axis.set_title(name)
             axis.axis("off")
         return figure
@@ -136,10 +137,11 @@ class OptimizationProgress:
             )
             dr.eval(mean, square)
             self._moments[key] = mean, square
-            # The moments begin with 0
+            # The moments begin with 0. Divided here, so that all steps share their kernels
             share = 1 - _KEPT ** len(self.losses)
-            means += float(dr.sum(dr.square(mean / share))[0])
-            variances += float(dr.sum(square / share - dr.square(mean / share))[0])
+            squared_mean = float(dr.sum(dr.square(mean))[0]) / share**2
+            means += squared_mean
+            variances += float(dr.sum(square)[0]) / share - squared_mean
         return math.sqrt(max(variances, 0) / means) if means > 0 else math.nan
 
     def _described(self) -> str:

@@ -44,8 +44,15 @@ def test_an_optimization_without_steps_or_images() -> None:
     optimizer["x"] = mi.Float(1)
     with pytest.raises(ValueError, match='"steps" is 0'):
         OptimizationProgress(optimizer, 0)
-    progress = OptimizationProgress(optimizer, 2, quiet=True)
+    progress = OptimizationProgress(optimizer, 4, quiet=True)
     assert progress._repr_png_().startswith(b"\x89PNG")
-    for _ in progress:
+    for step in progress:
+        before = dr.detail.launch_stats()
         progress.add(0.0)  # no gradient
+        # From the second step on, no kernel is new
+        assert step < 2 or dr.detail.launch_stats()[1:] == before[1:]
     assert np.isnan(progress.noises).all() and len(progress.plot().axes) == 2
+    for channels in (1, 4, 7):
+        progress.add(1.0, mi.TensorXf(np.ones((2, 3, channels))))
+        assert len(progress.plot().axes) == 4
+        assert progress._repr_png_().startswith(b"\x89PNG")
