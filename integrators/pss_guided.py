@@ -10,7 +10,7 @@ from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.guided_directions.decisions import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
-from mitsuba_ext.techniques.guided_directions.parameters import Guided, GuidedRoulette
+from mitsuba_ext.techniques.guided_directions.parameters import Guided, GuidedFlights, GuidedRoulette
 from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
@@ -120,6 +120,7 @@ class PSSGuided(WalkIntegrator):
             props,
             directions=Guided(self.reader(props)),
             roulette=GuidedRoulette(),
+            flights=GuidedFlights(),
             connections=Connections(none) if none else None,
             caustics=read_slot(self.name, props, "caustics"),
         )

@@ -48,7 +48,7 @@ _TECHNIQUES: tuple[type[Technique], ...] = (
 #: slots: later ones can use earlier ones.
 _PATH_WORDS = {
     "directions": "uniform", "scattering": "bsdf", "next_event": "uniform",
-    "light_numbers": "uniform", "roulette": "throughput", "connections": "one", "mis": "power",
+    "light_numbers": "uniform", "roulette": "throughput", "flights": "transmittance", "connections": "one", "mis": "power",
     "shadow_test": "always", "caustics": "scattered", "aperture": "sampler", "time": "sampler",
     "wavelength": "sampler", "distance": "sampler",
 }  # fmt: skip

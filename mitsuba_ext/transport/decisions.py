@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 from .estimator import Estimator
+from .free_flight import Distances
 from .numbers import Numbers
 from .path_decisions import (
     ConnectionCount,
@@ -77,6 +78,7 @@ class Decisions(CameraSamples):
         next_event: Chooses a light and the point on it to connect to.
         light_numbers: Warps the primary samples of ``next_event``.
         roulette: The probability with which a path continues.
+        flights: Draws the random numbers that choose how far a path flies in a medium.
         connections: The number of points on lights to which a vertex is connected.
         mis: The MIS weights of connections and of scattering.
         shadow_test: Decides whether the shadow ray of a connection is traced.
@@ -92,6 +94,7 @@ class Decisions(CameraSamples):
     next_event: EmitterSampling | None = None
     light_numbers: WarpedLights | None = None
     roulette: Roulette | None = None
+    flights: Distances | None = None
     connections: ConnectionCount | None = None
     mis: Weights | None = None
     shadow_test: ShadowTest | None = None
@@ -110,6 +113,7 @@ class Decisions(CameraSamples):
         chosen = {name: getattr(self, name) for name in _WALK_SLOTS}
         if self.light_numbers is not None:
             chosen["next_event"] = self.light_numbers.around(self.next_event or EmitterSampling())
+        chosen["distance"] = self.flights
         return {name: decision for name, decision in chosen.items() if decision is not None}
 
 

@@ -21,10 +21,13 @@ class Distances:
             throughput is multiplied by the transmittance.
         exact_transmittance: Whether shadow rays use the closed-form transmittance of homogeneous
             media. ``volpath`` samples a distance in each, with more noise in the same time.
+        waits: Whether some distances are chosen when the surface at the end of the flight is known
+            (:meth:`is_late`, :meth:`warp`).
     """
 
     scatter = True
     exact_transmittance = True
+    waits = False
 
     def begin(self, rays: CameraRays) -> Any:
         """The state before the first flight: whether the number of the ray has been used."""
@@ -38,6 +41,32 @@ class Distances:
             return sampler.next_1d(active), state
         u = dr.select(state, sampler.next_1d(active & state), rays.distance)
         return u, state | active
+
+    def is_late(self, state: Any) -> mi.Bool:
+        """Whether the distance of the flight whose number was drawn last is chosen when the surface
+        at its end is known; called where :attr:`waits`."""
+        raise NotImplementedError
+
+    def warp(
+        self,
+        u: mi.Float,
+        ray: mi.Ray3f,
+        si: mi.SurfaceInteraction3f,
+        σ: mi.Float,
+        σ_s: mi.Float,
+        active: mi.Bool,
+    ) -> tuple[mi.Float, mi.Bool, mi.Float]:
+        """Warps the number of a flight towards the surface ``si``; called where :attr:`waits`.
+
+        Parameters:
+            σ, σ_s: The extinction with which the distance is sampled, and the scattering
+                coefficient.
+
+        Returns:
+            The distance at which the path scatters; whether it does so before the surface; and
+            1 / density of the warped number.
+        """
+        raise NotImplementedError
 
 
 def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:

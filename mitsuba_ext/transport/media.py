@@ -47,6 +47,8 @@ class Inside:
         distances: The state of the decision that chooses distances (:class:`Distances`).
         shares: The probability with which each colour chooses the next distance, in scenes with
             chromatic media; ``None`` in others, where one colour chooses all distances of a path.
+        number: The number of a flight whose distance is chosen at its end, −1 for other flights;
+            ``None`` if there are only these.
     """
 
     medium: mi.MediumPtr
@@ -54,6 +56,7 @@ class Inside:
     reach: mi.Float
     distances: Any
     shares: mi.UnpolarizedSpectrum | None = None
+    number: mi.Float | None = None
 
 
 class NoMedia:
@@ -91,6 +94,10 @@ class NoMedia:
         """The next vertex of a path whose ``ray`` hits ``si``: at ``si``, or in a medium on the
         way; the throughput up to the vertex; and the part of the vertex that concerns media."""
         return si, β, None
+
+    def sampling_weight(self, path: PathState, in_medium: MediumVertex | None) -> mi.Float:
+        """The sampling weight of ``path`` at its next vertex, from :meth:`fly`."""
+        return path.sampling_weight
 
     def meets(self, pi: mi.PreliminaryIntersection3f, inside) -> mi.Bool:
         """Whether a ray that was launched may have one more vertex."""
@@ -189,7 +196,9 @@ class Media(NoMedia):
             channel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
         sampler.next_1d()  # `volpath` draws a roulette number that camera rays do not use
         distances = self._distances.begin(rays)
-        return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
+        number = mi.Float(-1) if self._distances.waits else None
+        reach = mi.Float(dr.inf)
+        return Inside(mi.MediumPtr(rays.medium), channel, reach, distances, number=number)
 
     def launch(self, inside, β, sampler, rays, ray, active):
         if not self._distances.scatter:
@@ -200,10 +209,13 @@ class Media(NoMedia):
         # 1 − u > 0; an extinction of 0 gives an infinite distance
         u, distances = self._distances.draw(inside.distances, sampler, rays, known)
         t = -dr.log(1 - u) / σ
-        reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
+        reach, number = dr.select(known & (t <= ray.maxt), t, dr.inf), None
+        if self._distances.waits:
+            is_late = known & self._distances.is_late(distances)
+            reach, number = dr.select(is_late, dr.inf, reach), dr.select(is_late, u, -1)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.minimum(ray.maxt, reach)
-        return ray, replace(inside, reach=reach, distances=distances)
+        return ray, replace(inside, reach=reach, distances=distances, number=number)
 
     def behind(self, query, scene, ray, pi, active):
         last, behind = behind_emitters(query, scene, ray, pi, active)
@@ -218,12 +230,16 @@ class Media(NoMedia):
         is_homogeneous = in_medium & inside.medium.is_homogeneous()
         σ = extinction(inside.medium, ray, is_homogeneous)
         scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
-        t = dr.minimum(inside.reach, si.t)
+        t, guided = dr.minimum(inside.reach, si.t), None
+        if self._distances.waits:
+            t, scatters, guided = self._late(inside, ray, si, σ, t, scatters, is_homogeneous)
         flown = t
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` draws whether the collision is real
         weight = self._flown(σ, σ_s, t, scatters, inside)
+        if guided is not None:
+            weight *= guided
         β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
         # ----- Media of varying density -----
         if self._has_grids:
@@ -235,7 +251,26 @@ class Media(NoMedia):
         mei = interaction_at(ray, ray(t), inside.medium)
         # Costs nothing where it is not used
         attenuated = dr.select(is_homogeneous, channel_mean(attenuation(σ, flown)), 1)
-        return vertex_at(si, mei, t, scatters), β, MediumVertex(scatters, mei, attenuated)
+        return vertex_at(si, mei, t, scatters), β, MediumVertex(scatters, mei, attenuated, guided)
+
+    def _late(self, inside, ray, si, σ, t, scatters, active):
+        """``t`` and ``scatters``, also of flights whose distance is chosen now, and the weight of
+        the choice."""
+        is_late = active & (inside.number >= 0)
+        σ_s, _, _ = inside.medium.get_scattering_coefficients(
+            interaction_at(ray, ray.o, inside.medium), is_late
+        )
+        chosen = self._rate(mi.Spectrum(σ_s), inside)
+        late_t, late_scatters, weight = self._distances.warp(
+            inside.number, ray, si, self._rate(σ, inside), chosen, is_late
+        )
+        t = dr.select(is_late, late_t, t)
+        return t, dr.select(is_late, late_scatters, scatters), weight
+
+    def sampling_weight(self, path, in_medium):
+        if in_medium.weight is None:
+            return path.sampling_weight
+        return path.sampling_weight * in_medium.weight
 
     def _rate(self, σ, inside):
         """The extinction ``σ`` with which the distance of a flight is sampled."""

@@ -66,11 +66,14 @@ class MediumVertex:
             has the medium through which the path has arrived.
         attenuation: The transmittance of the homogeneous medium on the way from the previous vertex
             or index-matched surface, as the mean over the colours; 1 for other media.
+        weight: 1 / density of the number that chose the distance of the flight; ``None`` where all
+            numbers are uniform.
     """
 
     scatters: mi.Bool
     mei: mi.MediumInteraction3f
     attenuation: mi.Float | None = None
+    weight: mi.Float | None = None
 
 
 @dataclass

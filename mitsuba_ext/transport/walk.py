@@ -181,6 +181,7 @@ class Walk:
             if dr.hint(replays_media, mode="scalar"):
                 start = FlightEnd(si, path.β, None)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
+            path.sampling_weight = media.sampling_weight(path, in_medium)
             path.history = self.program.arrive(path, si, in_medium)
 
             if dr.hint(replays_media, mode="scalar"):

@@ -29,6 +29,7 @@ class NestedRegions:
 
     Attributes:
         count (int): Number of regions.
+        origin (np.ndarray), size (np.ndarray): The bounding box that is divided into voxels.
         levels (list[slice]): The regions of each level.
         parent (np.ndarray): For each region, the containing region of the previous or an earlier
             level; shape [regions].
@@ -102,6 +103,14 @@ class NestedRegions:
         regions._table = from_numpy(mi.UInt32, table)
         dr.eval(regions._table)
         return regions
+
+    @property
+    def origin(self) -> np.ndarray:
+        return self._origin
+
+    @property
+    def size(self) -> np.ndarray:
+        return _GRIDS[-1] / self._scale
 
     def number(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> mi.UInt32:
         """The smallest region that contains a point with the normal ``n`` on its lit side."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,14 @@ from .sample_trees import SampleTrees
 #: The share of the samples that trees decide in the second pilot, and the shares from which one is
 #: chosen once their effects have been measured.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
+
+
+class FlightLearner(Protocol):
+    """Learns from what is recorded of flights in media."""
+
+    def update(self, pilot: Pilot, regions: Regions, records: PathRecords) -> None:
+        """Learns from the records of all pilots; the last one has recorded those from ``first_new``
+        on. The next stage guides directions."""
 
 
 class Guidance(NamedTuple):
@@ -65,6 +73,9 @@ class GuideLearner(Learner):
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
         trial (RouletteTrial): The measured effect of the roulette of the last pilot; ``None`` where
             none is learned.
+        regions (Regions): The regions that have a tree each; ``None`` before :meth:`start`, and where
+            no path scatters.
+        known (float): The share of all pilots' samples that the last pilot has recorded.
         sample_count (int): How many samples of directions the trees were built from.
     """
 
@@ -82,14 +93,16 @@ class GuideLearner(Learner):
         self.bounces, self.max_memory, self.pilot_samples = bounces, max_memory, pilot_samples
         self.always = always
         self.guide: GuidedDirections | None = None
+        self.regions: Regions | None = None
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
+        self._flights: FlightLearner | None = None
         self._film_size, self._pixels = film_size, PixelEstimates(*film_size)
         self.pixel_count = film_size[0] * film_size[1]
         #: The time of a sample, relative to ``path`` without guides
         self._time = 1.0
-        self.sample_count = 0
+        self.sample_count, self.known = 0, 0.0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
         self._batches: list[np.ndarray] = []
@@ -100,17 +113,17 @@ class GuideLearner(Learner):
         self._summary = "no guide: no path scatters"
         if self.wants_scout and dr.width(p) == 0:
             return None
-        self._regions = self.make_regions(p, n)
+        self.regions = self.make_regions(p, n)
         self._begin_records()
         if not self.wants_scout:
             return None
         # As ``path``, but with the kernel of the pilots that follow
-        count = self._regions.tree_count
+        count = self.regions.tree_count
         if self._rr_depth is not None:
             self.roulette = AdjointRoulette.by_throughput(
-                self._regions, count, self.pixel_count
+                self.regions, count, self.pixel_count
             )
-        return GuidedDirections(SampleTrees.uniform(count), self._regions, self.bounces)
+        return GuidedDirections(SampleTrees.uniform(count), self.regions, self.bounces)
 
     def _begin_records(self) -> None:
         bytes_per_path = self.bounces * BYTES_PER_RECORD
@@ -119,14 +132,19 @@ class GuideLearner(Learner):
         stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
         if self._rr_depth is not None:
             self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
-        regions = self._regions
+        regions = self.regions
         self._records = PathRecords(
-            regions.label, self.bounces, stride, self._pixels, regions.gives_directions
+            regions.label, self.bounces, stride, self._pixels, regions.gives_directions,
+            self._flights is not None,
         )
 
     def learn_roulette(self, rr_depth: int) -> None:
         """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
         self._rr_depth = rr_depth
+
+    def learn_flights(self, flights: FlightLearner) -> None:
+        """Makes this learner tell another one the regions and what it has recorded of flights."""
+        self._flights = flights
 
     @property
     def learns_beside_light_paths(self) -> bool:
@@ -146,7 +164,7 @@ class GuideLearner(Learner):
             self.make_regions, self.wants_scout, self.bounces, self.max_memory,
             self.pilot_samples, self._film_size, self.always,
         )  # fmt: skip
-        other.guide, other._share, other._regions = self.guide, self._share, self._regions
+        other.guide, other._share, other.regions = self.guide, self._share, self.regions
         other._summary, other._time = self._summary, time
         other._begin_records()
         return other
@@ -200,9 +218,10 @@ class GuideLearner(Learner):
             return None
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
+        self.known = records.paths * records.stride / self.pilot_samples
         if self.guide is not None and records.count > records.first_new:
             # A short trial shows whether guiding is hopeless, but not how many bounces to guide
-            known = records.paths * records.stride / self.pilot_samples
+            known = self.known
             gains = self.gains(records)
             bar = least(Prediction(1.0, 1.0, share=known, grows=True), pilot.is_last)
             against_path = self._against_path(gains, bar)
@@ -219,9 +238,11 @@ class GuideLearner(Learner):
             effect = f"about {max(gain, 0):.0%} less variance"
             if not (self.always or pilot.pays(prediction)):
                 self.guide, self._records, self.roulette = None, None, Roulette()
-                self._summary = f"no guide: with {self._regions}, {effect}"
+                self._summary = f"no guide: with {self.regions}, {effect}"
                 return None
-        nodes, roots, below = self._regions.build(records)
+        if self._flights is not None:
+            self._flights.update(pilot, self.regions, records)
+        nodes, roots, below = self.regions.build(records)
         trees = SampleTrees(
             nodes.probability,
             nodes.child,
@@ -235,14 +256,14 @@ class GuideLearner(Learner):
             self.trial.restart()
         self._share = share
         self._summary = (
-            f"guide: {self._regions}, {records.count} samples, trees of "
+            f"guide: {self.regions}, {records.count} samples, trees of "
             f"{trees.bytes / 2**20:.1f} MiB for {bounces} bounces that decide {share:.0%} of the "
             f"samples, {effect}"
         )
-        self.guide = GuidedDirections(trees, self._regions, bounces)
+        self.guide = GuidedDirections(trees, self.regions, bounces)
         if self._rr_depth is not None:
-            radiance = self._regions.incident_radiance(records)
-            self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
+            radiance = self.regions.incident_radiance(records)
+            self.roulette = AdjointRoulette(self.regions, radiance, self._pixels.scale())
         return self.guide
 
     def state(self) -> dict[str, np.ndarray]:

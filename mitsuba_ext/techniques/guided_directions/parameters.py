@@ -9,7 +9,8 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
-from ...scene.media import may_have_media
+from ...scene.media import has_homogeneous_media, may_have_media
+from .distance_learner import DistanceLearner
 from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
 from .regions_with_media import RegionsWithMedia
@@ -96,4 +97,21 @@ class GuidedRoulette(Technique):
         return RouletteLearner(guide, setting.rr_depth)
 
 
-TECHNIQUES = Guided, GuidedRoulette
+class GuidedFlights(Technique):
+    """How far paths fly in homogeneous media, by the light that they find there, where directions
+    are guided by regions of surfaces; elsewhere by transmittance, as in Mitsuba's ``volpath``."""
+
+    name, is_default = "automatic", True
+    words = {"automatic": {}}
+    slots, finds_all_light = ("flights",), True
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        guide = others.get("directions")
+        if not isinstance(guide, GuideLearner) or not guide.wants_scout:
+            return None
+        if not has_homogeneous_media(setting.scene):
+            return None
+        return DistanceLearner(guide, setting.sensor.shutter_open(), guide.always)
+
+
+TECHNIQUES = Guided, GuidedRoulette, GuidedFlights

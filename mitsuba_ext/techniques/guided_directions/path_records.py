@@ -34,6 +34,10 @@ class Samples:
         batch: The batch of paths (``evidence.py``).
         measure: The area, in the square of cells, of a unit of primary samples: not 1 where the
             cells are cells of directions. ``None`` where there are no such samples.
+        found: What the path contributed from the vertex of the sample on, divided by the densities
+            of its samples. This and what follows is ``None`` where no flights are recorded.
+        carried: The throughput of the path when it arrived at the vertex.
+        flight: 1 / density of the number that chose the distance of the flight to the vertex.
     """
 
     region: mi.UInt32
@@ -46,6 +50,15 @@ class Samples:
     throughput: mi.Float
     batch: mi.UInt32
     measure: mi.Float | None = None
+    found: mi.Float | None = None
+    carried: mi.Float | None = None
+    flight: mi.Float | None = None
+
+    def chosen(self, chosen: mi.Bool) -> Samples:
+        """Some of the samples."""
+        index = dr.compress(chosen)
+        columns = (getattr(self, field.name) for field in fields(Samples))
+        return Samples(*(x if x is None else dr.gather(type(x), x, index) for x in columns))
 
 
 class PathRecords(Observer):
@@ -59,6 +72,7 @@ class PathRecords(Observer):
         pixels: Receives the radiance of the paths.
         gives_directions: Whether samples in media are points of directions
             (:class:`~mitsuba_ext.transport.path_decisions.DirectionSamples`).
+        flights: Whether flights in media are recorded.
 
     Attributes:
         paths (int): How many paths were recorded.
@@ -74,9 +88,10 @@ class PathRecords(Observer):
         stride: int,
         pixels: PixelEstimates,
         gives_directions: bool = False,
+        flights: bool = False,
     ) -> None:
-        self._gives_directions = gives_directions
-        self._measure: mi.Float | None = None
+        self._gives_directions, self._flights = gives_directions, flights
+        self._measure = self._carried = self._flight = None
         self._region, self.bounces, self.stride = region, bounces, stride
         self._pixels = pixels
         self._lanes = 0
@@ -103,6 +118,7 @@ class PathRecords(Observer):
         return (
             self._region, self.bounces, self._pixel, self._path, self._is_recorded, self._slots,
             self._keys, self._weights, self._before, self._throughput, self._total, self._measure,
+            self._carried, self._flight,
         )  # fmt: skip
 
     # ---- Observer of the walk ----
@@ -122,10 +138,12 @@ class PathRecords(Observer):
         )
         if self._gives_directions:
             self._measure = dr.full(mi.Float, 1, slots)
+        if self._flights:
+            self._carried, self._flight = (dr.full(mi.Float, 1, slots) for _ in range(2))
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         dr.eval(
             self._path, self._is_recorded, self._keys, self._weights, self._before,
-            self._throughput, self._total, self._measure,
+            self._throughput, self._total, self._measure, self._carried, self._flight,
         )  # fmt: skip
 
     def direction(self, vertex, sample, weight, L, active) -> None:
@@ -135,6 +153,10 @@ class PathRecords(Observer):
         dr.scatter(self._keys, key, slot, active)
         dr.scatter(self._weights, mi.Float(weight), slot, active)
         dr.scatter(self._before, brightness(L), slot, active)
+        if self._flights and vertex.medium is not None:
+            dr.scatter(self._carried, brightness(vertex.path.β), slot, active)
+            if vertex.medium.weight is not None:
+                dr.scatter(self._flight, vertex.medium.weight, slot, active)
 
     def scattering(self, vertex, bs, active) -> None:
         if self._gives_directions and vertex.medium is not None:
@@ -155,9 +177,12 @@ class PathRecords(Observer):
 
     def chosen(self, chosen: mi.Bool) -> Samples:
         """Some of the samples, after :meth:`finish`."""
-        index = dr.compress(chosen)
-        columns = (getattr(self, field.name) for field in fields(Samples))
-        return Samples(*(dr.gather(type(x), x, index) for x in columns))
+        return self.samples.chosen(chosen)
+
+    @property
+    def samples(self) -> Samples:
+        """All samples, after :meth:`finish`."""
+        return Samples(*(getattr(self, field.name) for field in fields(Samples)))
 
     def finish(self) -> None:
         """Ends the observation of a stage."""
@@ -188,9 +213,7 @@ class PathRecords(Observer):
         )
         bounce = slot // self._slots
         path = slot - bounce * self._slots
-        value = dr.maximum(dr.gather(mi.Float, self._total, path) - before, 0)
-        # Ignore infinite radiance: it would dominate the trees
-        value = dr.select(dr.isfinite(value), value, 0)
+        value = self._after(path, before)
         history = dr.zeros(mi.UInt32, len(slot))
         for earlier in range(min(self.bounces - 1, 32 // DEPTH)):
             is_earlier = earlier < bounce
@@ -203,10 +226,22 @@ class PathRecords(Observer):
             path % BATCHES,
             dr.gather(mi.Float, self._measure, slot) if self._gives_directions else None,
         )  # fmt: skip
+        if self._flights:
+            earlier = dr.gather(mi.Float, self._before, slot - self._slots, bounce > 0)
+            columns.found = self._after(path, earlier)
+            columns.carried, columns.flight = (
+                dr.gather(mi.Float, x, slot) for x in (self._carried, self._flight)
+            )
         dr.eval(columns)
         self._passes.append(columns)
         self._keys = self._weights = self._before = self._throughput = self._measure = None
-        self._total = self._pixel = None
+        self._total = self._pixel = self._carried = self._flight = None
+
+    def _after(self, path: mi.UInt32, before: mi.Float) -> mi.Float:
+        """What recorded paths contributed, except the radiance ``before``."""
+        value = dr.maximum(dr.gather(mi.Float, self._total, path) - before, 0)
+        # Ignore infinite radiance: it would dominate what is learned
+        return dr.select(dr.isfinite(value), value, 0)
 
 
 def _batch_sums(x: mi.Float) -> np.ndarray:

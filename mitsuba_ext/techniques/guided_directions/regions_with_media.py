@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...scene.regions.nested_regions import NestedRegions
 from ...util.arrays import joined
 from ...util.stored_arrays import StoredArrays
 from .path_records import PathRecords, Samples
@@ -92,6 +93,15 @@ class RegionsWithMedia:
         on_surface = self._surfaces.label(si, pixel, active & ~in_medium)
         region = self._media.number(si.p, mi.Normal3f(0), in_medium) + self._first
         return dr.select(in_medium, region, on_surface)
+
+    @property
+    def media(self) -> NestedRegions:
+        """The regions of media; their numbers follow those of surfaces."""
+        return self._media.regions
+
+    def of_media(self, p: mi.Point3f) -> mi.UInt32:
+        """The region of media that contains a point."""
+        return self._media.number(p, mi.Normal3f(0), mi.Bool(True)) + self._first
 
     def build(self, records: PathRecords) -> tuple[Nodes, mi.UInt32, None]:
         """See :meth:`SurfaceRegions.build`."""

@@ -38,7 +38,8 @@ class SurfaceRegions:
         most: The most regions.
 
     Attributes:
-        count: Number of regions that learn.
+        regions: The regions that learn.
+        count: Their number.
         gives_directions: Whether samples in media are points of directions
             (:class:`~mitsuba_ext.transport.path_decisions.DirectionSamples`).
     """
@@ -51,12 +52,12 @@ class SurfaceRegions:
         self._set(NestedRegions(p, n, least, most))
 
     def _set(self, regions: NestedRegions) -> None:
-        self._regions, self.count = regions, regions.count
+        self.regions, self.count = regions, regions.count
         self._specular = dr.opaque(mi.UInt32, self.count)
 
     def state(self) -> dict[str, np.ndarray]:
         """What the walk needs of the regions, as arrays."""
-        return self._regions.state()
+        return self.regions.state()
 
     def restore(self, state: StoredArrays) -> None:
         """Restores the regions from the arrays of :meth:`state`."""
@@ -93,7 +94,7 @@ class SurfaceRegions:
 
     def number(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> mi.UInt32:
         """The smallest region that contains a point with the normal ``n`` on its lit side."""
-        return self._regions.number(p, n, active)
+        return self.regions.number(p, n, active)
 
     def build(self, records: Samples) -> tuple[Nodes, mi.UInt32, None]:
         """Builds the trees.
@@ -103,28 +104,28 @@ class SurfaceRegions:
             trees. The tree of the surrounding region is the prior of a region's tree.
         """
         parent = self._parents()
-        levels, tree = self._regions.levels, records.region
+        levels, tree = self.regions.levels, records.region
         cells = Cells.of(records.code, records.value, records.weight, tree, parent, levels)
         nodes = grown(cells, parent, len(levels), levels[-1].start)
         return nodes, dr.arange(mi.UInt32, self.count + 1), None
 
     def _parents(self) -> mi.UInt32:
         """For each region, the one around it; mirrors and glass have none."""
-        return from_numpy(mi.UInt32, np.append(self._regions.parent, self.count))
+        return from_numpy(mi.UInt32, np.append(self.regions.parent, self.count))
 
     def incident_radiance(self, records: Samples) -> mi.Float:
         """The mean radiance that bounces find in each region; the surrounding region is the prior.
         −1 for mirrors and glass. Shape [regions]."""
         value, throughput, count = self._sums(records)
-        for regions in reversed(self._regions.levels[1:]):
+        for regions in reversed(self.regions.levels[1:]):
             for x in (value, throughput, count):
-                np.add.at(x, self._regions.parent[regions], x[regions])
+                np.add.at(x, self.regions.parent[regions], x[regions])
         radiance = np.full(self.count + 1, -1.0)
-        for level, regions in enumerate(self._regions.levels):
+        for level, regions in enumerate(self.regions.levels):
             prior, expected = 0.0, 0.0
             if level > 0:
                 prior = _PRIOR * throughput[regions] / np.maximum(count[regions], 1)
-                expected = radiance[self._regions.parent[regions]]
+                expected = radiance[self.regions.parent[regions]]
             radiance[regions] = (value[regions] + prior * expected) / np.maximum(
                 throughput[regions] + prior, 1e-30
             )

@@ -217,8 +217,8 @@ def test_mirrors_and_glass_neither_learn_nor_are_guided(surfaces: SurfaceRegions
 def _around(surfaces: SurfaceRegions, level: int) -> np.ndarray:
     """For each region, the region of a level in which it lies; itself if there is none."""
     around = np.arange(surfaces.count + 1)
-    for smaller in surfaces._regions.levels[level + 1 :]:
-        around[smaller] = around[surfaces._regions.parent[smaller]]
+    for smaller in surfaces.regions.levels[level + 1 :]:
+        around[smaller] = around[surfaces.regions.parent[smaller]]
     return around
 
 
@@ -226,8 +226,8 @@ def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> No
     p, n = _points(20_000)
     labels, side = _labels(surfaces, p, n), np.where(n[2] > 0, 1, -1)
     extents, inside = [], []
-    for level in range(len(surfaces._regions.levels)):
-        around, regions = _around(surfaces, level)[labels], surfaces._regions.levels[level]
+    for level in range(len(surfaces.regions.levels)):
+        around, regions = _around(surfaces, level)[labels], surfaces.regions.levels[level]
         members = [around == region for region in range(regions.start, regions.stop)]
         assert all(LEAST <= chosen.sum() for chosen in members)
         extents.append(max(np.ptp(p[:, chosen], axis=1).max() for chosen in members))
@@ -263,14 +263,14 @@ def test_a_region_without_samples_has_the_density_of_the_one_around_it(
     # Of a region and all smaller ones in it
     count = np.bincount(region.numpy(), minlength=surfaces.count)
     for smaller in reversed(range(1, surfaces.count)):
-        count[surfaces._regions.parent[smaller]] += count[smaller]
+        count[surfaces.regions.parent[smaller]] += count[smaller]
     empty = np.flatnonzero(count == 0)
     assert len(empty) > 10
     place = mi.Point2f(0.2, 0.6)
     for tree in empty[:: len(empty) // 10]:
         found, around = (
             trees.density(mi.UInt32(int(t)), place, mi.Bool(True))[0].numpy()[0]
-            for t in (tree, surfaces._regions.parent[tree])
+            for t in (tree, surfaces.regions.parent[tree])
         )
         assert found == around
     assert trees.density(mi.UInt32(0), place, mi.Bool(True))[0].numpy()[0] > 1.5

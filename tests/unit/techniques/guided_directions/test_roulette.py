@@ -101,7 +101,7 @@ def test_a_region_expects_the_light_of_the_region_around_it() -> None:
     up = np.tile([[0], [0], [1]], 16)
     regions = SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 8)
     finest = regions.count - 1
-    parent = regions._regions.parent[finest]
+    parent = regions.regions.parent[finest]
     region = np.r_[np.full(1000, finest - 1), np.full(8, finest), [regions.count]]
     records = SimpleNamespace(
         region=mi.UInt32(region.astype(np.uint32)),

@@ -1,0 +1,159 @@
+"""Learns the distances of flights in media, beside guided directions."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...planning.costs import GUIDED_FLIGHTS
+from ...planning.learner import Learner, Pilot
+from ...planning.prediction import Effect, Prediction
+from ...scene.media import may_have_grids
+from ...transport.queries.scene import scene_query
+from ...util.arrays import from_numpy
+from ...util.stored_arrays import StoredArrays
+from .guided_distances import GuidedDistances
+from .learner import GuideLearner
+from .path_records import PathRecords
+from .regions_with_media import RegionsWithMedia
+from .scattered_light import RESOLUTION, Box, DirectLight, ScatteredLight
+
+
+class DistanceLearner(Learner):
+    """Learns from the records of a learner of directions, which precedes this one, in its regions.
+    Distances are given up where pilots show that they do not pay, or that no directions are guided.
+
+    Parameters:
+        guide: The learner of directions, by regions of surfaces and media.
+        time: The time at which direct light is computed.
+        always: Guide distances also where they do not pay?
+
+    Attributes:
+        decision (GuidedDistances): What was learned; ``None`` where nothing is guided.
+        gain: The relative reduction of variance in the last pilot.
+    """
+
+    def __init__(self, guide: GuideLearner, time: float, always: bool) -> None:
+        self._guide, self._time, self._always = guide, time, always
+        self.decision: GuidedDistances | None = None
+        self.gain: float | None = None
+        self._direct: DirectLight | None = None
+        self._medium: mi.UInt32 | None = None
+        guide.learn_flights(self)
+
+    def start(
+        self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f
+    ) -> GuidedDistances | None:
+        regions = self._guide.regions
+        if regions is None:
+            return None
+        self._box = Box(regions.media.origin, regions.media.size)
+        self._direct = DirectLight(self._box)
+        # The medium of each region
+        self._medium = dr.zeros(mi.UInt32, regions.tree_count)
+        dr.make_opaque(self._medium)
+        # As ``path``, but with the kernel of the pilots that follow
+        unknown = dr.full(mi.Float, -1, regions.tree_count)
+        light = ScatteredLight.unknown(self._box)
+        self.decision = GuidedDistances(light, regions, unknown, self._flights)
+        return self.decision
+
+    @property
+    def _flights(self) -> int:
+        # Before and after each bounce that may be guided
+        return self._guide.bounces + 1
+
+    # ---- Observer ----
+
+    def kernel_state(self) -> tuple:
+        """The attributes on which kernels depend (``frozen.py``)."""
+        return (self._medium,)
+
+    def direction(self, vertex, sample, weight, L, active) -> None:
+        if self._medium is None or vertex.medium is None:
+            return
+        active = active & vertex.medium.scatters
+        region = self._guide.regions.label(vertex.si, None, active)
+        medium = dr.reinterpret_array(mi.UInt32, vertex.medium.mei.medium)
+        # Where several media share a region, the largest index, so that the order does not matter
+        dr.scatter_reduce(dr.ReduceOp.Max, self._medium, medium, region, active)
+
+    # ---- Between the stages ----
+
+    def update(self, pilot: Pilot, regions: RegionsWithMedia, records: PathRecords) -> None:
+        """Learns from all records, of which those from ``first_new`` on are the last pilot's."""
+        if self.decision is None:
+            return
+        if self._direct.points > 0:
+            self.gain, known = self._gain_of(records), records.first_new > 0
+            prediction = Prediction(1 - self.gain, GUIDED_FLIGHTS, share=self._guide.known)
+            if known and not (self._always or pilot.pays(prediction)):
+                self.decision = self._direct = self._medium = None
+                return
+        centre = mi.Point3f(0.5)
+        voxel = dr.arange(mi.UInt32, RESOLUTION**3)
+        region = regions.of_media(self._box.point(voxel, centre))
+        medium = dr.reinterpret_array(mi.MediumPtr, dr.gather(mi.UInt32, self._medium, region))
+        scene = pilot.scene
+        self._direct.add(scene, scene_query(scene), medium, may_have_grids(scene), self._time)
+        # What media scatter more than once
+        indirect = regions.incident_radiance(records)
+        values = self._direct.mean + dr.gather(mi.Float, indirect, region)
+        outside = dr.gather(mi.Float, indirect, regions.of_media(mi.Point3f(dr.inf)))
+        samples = records.samples
+        samples.value, samples.throughput = samples.found, samples.carried
+        surfaces = regions.incident_radiance(samples)
+        light = ScatteredLight(self._box, values, outside)
+        self.decision = GuidedDistances(light, regions, surfaces, self._flights)
+
+    def _gain_of(self, records: PathRecords) -> float:
+        """The relative reduction of variance by the distances of the last pilot."""
+        new = dr.arange(mi.UInt32, records.count) >= dr.opaque(mi.UInt32, records.first_new)
+        drawn = dr.square(records.found) * records.importance
+        drawn = dr.select(new & dr.isfinite(drawn), drawn, 0)
+        more = float(dr.sum(mi.Float64(drawn * (dr.rcp(records.flight) - 1)))[0])
+        variance = records.variance + more
+        return more / variance if variance > 0 and np.isfinite(variance) else 0.0
+
+    def learn(self, pilot: Pilot) -> GuidedDistances | None:
+        if self._guide.guide is None:
+            self.decision = self._direct = self._medium = None
+        return self.decision
+
+    def finish(self) -> None:
+        self._direct = self._medium = None
+
+    def state(self) -> dict[str, np.ndarray]:
+        if self.decision is None:
+            return {}
+        light = self.decision.light
+        return {
+            "origin": light.box.origin, "size": light.box.size, "values": light.values.numpy(),
+            "outside": light.outside.numpy(), "surfaces": self.decision.surfaces.numpy(),
+            "flights": np.array(self.decision.flights),
+        }  # fmt: skip
+
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> GuidedDistances:
+        regions = self._guide.guide.regions
+        box = Box(state.take("origin", "f", (3,)), state.take("size", "f", (3,), least=0))
+        values = state.take("values", "f", (RESOLUTION**3,), least=0)
+        outside = state.take("outside", "f", (1,), least=-1)
+        surfaces = state.take("surfaces", "f", (regions.tree_count,), least=-1)
+        flights = state.number("flights", "iu", 1, 1 << 20)
+        light = ScatteredLight(box, from_numpy(mi.Float, values), from_numpy(mi.Float, outside))
+        surfaces = from_numpy(mi.Float, surfaces)
+        self.decision = GuidedDistances(light, regions, surfaces, flights)
+        return self.decision
+
+    @property
+    def effect(self) -> Effect | None:
+        if self.gain is None:
+            return None if self.decision is None else Effect(True)
+        return Effect(self.decision is not None, 1 - self.gain, GUIDED_FLIGHTS)
+
+    def __str__(self) -> str:
+        if self.gain is None:
+            return ""
+        kept = "distances in media" if self.decision is not None else "no distances in media"
+        return f"{kept}: about {max(self.gain, 0):.0%} less variance"
