@@ -66,6 +66,13 @@ class ComposedPath(WalkIntegrator):
          surfaces, the survival probability grows with the radiance that the guide expects the path
          to find, relative to the brightness of its pixel. In all other cases, or if pilot samples
          show that this does not pay, the rule is :monosp:`throughput`. (Default: automatic)
+     * - flights
+       - |string|
+       - How far paths fly in homogeneous media before they scatter. :monosp:`transmittance` is the
+         choice of :monosp:`volpath`. With :monosp:`automatic`, and directions guided by regions of
+         surfaces, paths scatter more often where much light arrives (see
+         :monosp:`guided_directions`). In all other cases, or if pilot samples show that this does
+         not pay, the choice is :monosp:`transmittance`. (Default: automatic)
      * - connections
        - |string|, |int| or |decision|
        - How many points on lights the first vertex of a path is connected to: :monosp:`one`, a

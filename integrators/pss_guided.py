@@ -10,7 +10,11 @@ from mitsuba_ext.planning.technique import ParameterReader
 from mitsuba_ext.startup import registry
 from mitsuba_ext.techniques.guided_directions.decisions import GuidedDirections
 from mitsuba_ext.techniques.guided_directions.learner import GuideLearner
-from mitsuba_ext.techniques.guided_directions.parameters import Guided, GuidedFlights, GuidedRoulette
+from mitsuba_ext.techniques.guided_directions.parameters import (
+    Guided,
+    GuidedFlights,
+    GuidedRoulette,
+)
 from mitsuba_ext.techniques.weighted_points.connections import Connections
 
 
@@ -91,7 +95,8 @@ class PSSGuided(WalkIntegrator):
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
     Participating media are rendered as in :monosp:`volpath`. The directions in which fog scatters
-    are guided, too. Gradients are not supported (use :class:`composed_prb`); neither are scalar and
+    are guided, too, and in homogeneous media also how far a path flies before it scatters.
+    Gradients are not supported (use :class:`composed_prb`); neither are scalar and
     polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of

@@ -65,8 +65,14 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     In participating media, phase functions take the place of BSDFs. They scatter relative to the
     direction of the path, so that equal numbers lead to other directions in each path. The trees of
     media are therefore over directions in space, of which at least a fifth is drawn from the phase
-    function. How far a path flies before it scatters is not guided (but see :class:`swarm_path`).
-    With tiles, the numbers of phase functions are guided like the numbers of BSDFs.
+    function. With tiles, the numbers of phase functions are guided like the numbers of BSDFs.
+
+    With regions of surfaces, the distance at which a path scatters in a homogeneous medium is
+    guided, too (:monosp:`flights` of :monosp:`composed_path`), and with it the probability that it
+    scatters before the next surface. Both follow the radiance along the ray. What lamps send to the
+    fog is computed in a grid of 64 x 64 x 64 voxels; what fog and surfaces scatter is learned. Half
+    of the distances remain those of :monosp:`volpath`. Distances in grids (:monosp:`heterogeneous`)
+    are not guided.
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, to no effect). With regions of surfaces, Russian roulette is learned as
@@ -78,8 +84,9 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light
     Transport Simulation*, 2016: roulette (without splitting). S. Herholz et al., *Volume Path
-    Guiding Based on Zero-Variance Random Walk Theory*, 2019: directions in media. The regions of
-    surfaces, the estimates, and the measurement of the gain are ours.
+    Guiding Based on Zero-Variance Random Walk Theory*, 2019: directions and distances in media. K.
+    Xu et al., *Volume Scattering Probability Guiding*, 2024: the probability of scattering. The
+    regions of surfaces, the estimates, and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

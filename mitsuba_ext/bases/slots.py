@@ -48,9 +48,9 @@ _TECHNIQUES: tuple[type[Technique], ...] = (
 #: slots: later ones can use earlier ones.
 _PATH_WORDS = {
     "directions": "uniform", "scattering": "bsdf", "next_event": "uniform",
-    "light_numbers": "uniform", "roulette": "throughput", "flights": "transmittance", "connections": "one", "mis": "power",
-    "shadow_test": "always", "caustics": "scattered", "aperture": "sampler", "time": "sampler",
-    "wavelength": "sampler", "distance": "sampler",
+    "light_numbers": "uniform", "roulette": "throughput", "flights": "transmittance",
+    "connections": "one", "mis": "power", "shadow_test": "always", "caustics": "scattered",
+    "aperture": "sampler", "time": "sampler", "wavelength": "sampler", "distance": "sampler",
 }  # fmt: skip
 
 #: The same for the slots that only integrators with light paths have.

@@ -28,8 +28,7 @@ SUMS, LIGHT_SEGMENT, CONNECTION, CONNECTED, GRID, LOOK = 0.17, 3.1, 0.3, 1.3, 0.
 #: shadow rays included.
 FIRST_GUIDED, GUIDED, RAYS_PER_SEGMENT = 0.7, 0.25, 1.5
 
-#: The time of a sample with guided distances in media, relative to one without (door_ajar, rooms and
-#: window in fog: MEASURE).
+#: The time of a sample with guided distances in media, relative to one without.
 GUIDED_FLIGHTS = 1.25
 
 #: The candidates of resampled lights, and the connections to lights, that take about as long as a

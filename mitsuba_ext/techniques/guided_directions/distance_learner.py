@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...planning.costs import GUIDED_FLIGHTS
+from ...planning.evidence import BATCHES, gain_of
 from ...planning.learner import Learner, Pilot
 from ...planning.prediction import Effect, Prediction
 from ...scene.media import may_have_grids
@@ -86,9 +87,10 @@ class DistanceLearner(Learner):
         if self.decision is None:
             return
         if self._direct.points > 0:
-            self.gain, known = self._gain_of(records), records.first_new > 0
-            prediction = Prediction(1 - self.gain, GUIDED_FLIGHTS, share=self._guide.known)
-            if known and not (self._always or pilot.pays(prediction)):
+            self.gain, error = gain_of(self._sums(records))
+            share = self._guide.known
+            prediction = Prediction(1 - self.gain, GUIDED_FLIGHTS, error, share, grows=True)
+            if not (self._always or pilot.pays(prediction)):
                 self.decision = self._direct = self._medium = None
                 return
         centre = mi.Point3f(0.5)
@@ -107,14 +109,14 @@ class DistanceLearner(Learner):
         light = ScatteredLight(self._box, values, outside)
         self.decision = GuidedDistances(light, regions, surfaces, self._flights)
 
-    def _gain_of(self, records: PathRecords) -> float:
-        """The relative reduction of variance by the distances of the last pilot."""
+    def _sums(self, records: PathRecords) -> np.ndarray:
+        """For each batch of the last pilot's paths: the variance, and what distances have saved."""
         new = dr.arange(mi.UInt32, records.count) >= dr.opaque(mi.UInt32, records.first_new)
-        drawn = dr.square(records.found) * records.importance
-        drawn = dr.select(new & dr.isfinite(drawn), drawn, 0)
-        more = float(dr.sum(mi.Float64(drawn * (dr.rcp(records.flight) - 1)))[0])
-        variance = records.variance + more
-        return more / variance if variance > 0 and np.isfinite(variance) else 0.0
+        # The mean of value² / weight is the second moment of uniform numbers
+        saved = dr.square(records.found) * records.importance * (dr.rcp(records.flight) - 1)
+        sums = dr.zeros(mi.Float64, BATCHES)
+        dr.scatter_add(sums, mi.Float64(saved), records.batch, new & dr.isfinite(saved))
+        return np.stack([records.variances, sums.numpy()])
 
     def learn(self, pilot: Pilot) -> GuidedDistances | None:
         if self._guide.guide is None:

@@ -73,7 +73,7 @@ class GuideLearner(Learner):
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
         trial (RouletteTrial): The measured effect of the roulette of the last pilot; ``None`` where
             none is learned.
-        regions (Regions): The regions that have a tree each; ``None`` before :meth:`start`, and where
+        regions (Regions): The regions that have a tree each; ``None`` before :meth:`start`, and if
             no path scatters.
         known (float): The share of all pilots' samples that the last pilot has recorded.
         sample_count (int): How many samples of directions the trees were built from.

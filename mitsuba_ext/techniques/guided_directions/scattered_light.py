@@ -1,8 +1,8 @@
 """The radiance that media scatter, in the voxels of a box.
 
-It has two parts. What lamps send to a voxel is computed: paths rarely come near a lamp, where fog is
-brightest, and near a beam the radiance changes within a short distance. The rest varies slowly, and
-pilots learn it in regions.
+It has two parts. What lamps send to a voxel is computed: paths rarely come near a lamp, where fog
+is brightest, and at the edge of a beam the radiance changes within a short distance. The rest
+varies slowly, and pilots learn it in regions.
 """
 
 from __future__ import annotations

@@ -72,12 +72,7 @@ def _regions() -> RegionsWithMedia:
 
 
 def _guide(regions: RegionsWithMedia, samples: Samples, share: float = 0.8) -> GuidedDirections:
-    records = SimpleNamespace(
-        region=samples.region,
-        chosen=lambda chosen: Samples(**{
-            name: dr.gather(type(x), x, dr.compress(chosen)) for name, x in vars(samples).items()
-        }),
-    )  # fmt: skip
+    records = SimpleNamespace(region=samples.region, chosen=samples.chosen)
     nodes, roots, _ = regions.build(records)
     assert len(roots) == regions.tree_count
     arrays = nodes.probability, nodes.child, nodes.is_even, roots
@@ -228,6 +223,10 @@ HARD = {
     "around_the_camera": lambda: fog_around_the_camera("area"),
     "empty_cloud": _empty_cloud,
     "several": _several,
+    "lamp_inside": lambda: fog("area_inside", homogeneous(0.3, 0.9)),
+    "coloured": lambda: fog("area", homogeneous([3.0, 1.0, 0.5], 0.9)),
+    "dense": lambda: fog("area", homogeneous(40.0, 0.9)),
+    "black": lambda: fog("area_inside", homogeneous(1.0, 0.0)),
 }
 
 

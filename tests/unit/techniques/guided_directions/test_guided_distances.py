@@ -1,0 +1,127 @@
+"""Distances in media: the warp of their numbers, what it knows of light, and when it is used."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.techniques.guided_directions.guided_distances import SHARE, GuidedDistances
+from mitsuba_ext.techniques.guided_directions.scattered_light import (
+    RESOLUTION,
+    Box,
+    DirectLight,
+    ScatteredLight,
+)
+from mitsuba_ext.transport.queries.scene import scene_query
+from tests.support.fogs import LIGHTS, cube, fog, homogeneous
+from tests.support.statistical import sidak, some
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LANES = 1 << 17
+
+#: A lamp lights the fog between these distances along the ray.
+_NEAR, _FAR = 0.5, 0.75
+
+
+def _distances(surface: float, dark: bool = False) -> GuidedDistances:
+    """In a box of edge 2 with a bright slab; a ``surface`` of this radiance ends flights."""
+    box = Box(np.zeros(3), np.full(3, 2.0))
+    z = (np.arange(RESOLUTION**3) // RESOLUTION**2 + 0.5) * 2 / RESOLUTION
+    values = np.where((z > _NEAR) & (z < _FAR), 40, 0.5).astype(np.float32)
+    light = ScatteredLight(box, mi.Float(0 * values if dark else values), mi.Float(0.0))
+    regions = SimpleNamespace(label=lambda si, pixel, active: mi.UInt32(0))
+    return GuidedDistances(light, regions, mi.Float([surface]), 3)
+
+
+def _flights(distances: GuidedDistances, σ: float, end: float, albedo: float = 0.8):
+    """The distances, whether paths scatter there, and the weights of flights along the z axis."""
+    u = np.random.default_rng(5).random(LANES, dtype=np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    si.t = mi.Float(end)
+    ray = mi.Ray3f(mi.Point3f(1, 1, 1e-3), mi.Vector3f(0, 0, 1))
+    arguments = (mi.Float(σ), mi.Float(σ * albedo), mi.Bool(True))
+    t, scatters, weight = distances.warp(mi.Float(u), ray, si, *arguments)
+    return t.numpy(), scatters.numpy(), weight.numpy() * np.ones(LANES)
+
+
+CASES = {
+    "thin": (0.1, 1.5, 2.0), "thick": (5.0, 1.5, 2.0), "dense": (1e4, 1.5, 2.0),
+    "bright_surface": (0.5, 1.0, 100.0), "black_surface": (0.5, 1.0, 0.0),
+    "unknown_surface": (0.5, 1.0, -1.0), "no_surface": (0.5, np.inf, -1.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_weighted_distances_have_the_density_of_transmittance(name: str) -> None:
+    """In each of 64 intervals, and on the surface."""
+    σ, end, surface = CASES[name]
+    t, scatters, weight = _flights(_distances(surface), σ, end)
+    assert np.isfinite(t[scatters]).all() and (t[scatters] >= 0).all() and (t <= end).all()
+    assert weight.max() <= 1 / (1 - SHARE) + 1e-4 and weight.min() > 0
+    through = np.exp(-σ * end)
+    # By the uniform number that leads to a distance
+    number = -np.expm1(-σ * t[scatters].astype(np.float64))
+    collides = 1 - through
+    bins = 64, (0, collides * (1 + 1e-5))
+    found, square = (
+        np.histogram(number, *bins, weights=weight[scatters] ** power)[0] for power in (1, 2)
+    )
+    z = (found - LANES * collides / 64) / np.sqrt(square)
+    assert np.abs(z).max() < sidak(64)
+    missed = weight[~scatters]
+    assert abs(missed.sum() - LANES * through) < 4 * max(1, np.linalg.norm(missed))
+
+
+def test_paths_scatter_where_light_arrives() -> None:
+    """The slab has 0.015 of the numbers of a thin medium; half of all numbers are warped."""
+    t, scatters, _ = _flights(_distances(0.1), 0.1, 1.5)
+    slab = (scatters & (t > _NEAR) & (t < _FAR)).mean()
+    assert 0.35 < slab < 0.5
+    # Most of the light comes from the surface
+    _, scatters, _ = _flights(_distances(1e3), 0.1, 1.5)
+    assert scatters.mean() < 0.6 * (1 - np.exp(-0.15))
+    # A black medium is passed
+    _, scatters, _ = _flights(_distances(0.1), 0.5, 1.5, albedo=0.0)
+    assert scatters.mean() == pytest.approx((1 - SHARE) * (1 - np.exp(-0.75)), abs=5e-3)
+
+
+@pytest.mark.parametrize("σ, dark, surface", [(0.5, True, -1.0), (0.5, True, 0.0), (0.0, False, 1)])
+def test_where_nothing_is_known_all_weights_are_one(σ: float, dark: bool, surface: float) -> None:
+    _, scatters, weight = _flights(_distances(surface, dark), σ, 1.0)
+    assert (weight == 1).all()
+    assert scatters.mean() == pytest.approx(-np.expm1(-σ), abs=5e-3)
+
+
+def test_light_from_a_lamp_reaches_voxels_through_fog() -> None:
+    lamp = {"type": "point", "position": [0.0, 3.0, 0.0], "intensity": 4 * np.pi}
+    scene = mi.load_dict({"type": "scene", "fog": cube(homogeneous(0.7)), "lamp": lamp})
+    (shape,) = scene.shapes()
+    box = Box(np.full(3, -0.9), np.full(3, 1.8))
+    direct = DirectLight(box)
+    voxel = dr.arange(mi.UInt32, RESOLUTION**3)
+    p = box.point(voxel, mi.Point3f(0.5)).numpy()
+    medium = dr.select(voxel > 0, mi.MediumPtr(shape.interior_medium()), mi.MediumPtr(None))
+    for _ in range(2):
+        direct.add(scene, scene_query(scene), medium, False, 0.0)
+    way = np.array([0.0, 3.0, 0.0])[:, None] - p
+    r = np.linalg.norm(way, axis=0)
+    expected = np.exp(-0.7 * r * (1 - p[1]) / (3 - p[1])) / r**2
+    found = direct.mean.numpy()
+    inside = abs(p[0] + way[0] * (1 - p[1]) / way[1]) < 1  # Enters through the upper face
+    np.testing.assert_allclose(found[1:], expected[1:], rtol=0.08)
+    assert inside.all() and found[0] == 0, "in a voxel of unknown medium there is no light"
+
+
+@pytest.mark.parametrize("kind", some("heterogeneous", of=["none", "heterogeneous"]))
+def test_without_homogeneous_media_no_distances_are_learned(kind: str) -> None:
+    other = {"fog": LIGHTS["area"]} if kind == "none" else {}
+    medium = {"type": "heterogeneous", "sigma_t": {"type": "constvolume", "value": 1.0}}
+    scene = mi.load_dict(fog("point", medium, **other))
+    integrator = mi.load_dict({"type": "pss_guided", "always_guide": True, "pilot_spp": 4})
+    mi.render(scene, integrator=integrator, spp=16)
+    assert set(integrator.learners) == {"directions", "roulette"}
