@@ -105,7 +105,7 @@ class GuidedDistances(Distances):
         w = dr.select(passes, (v - scattered) / (1 - scattered), v / scattered)
         number = dr.select(passes, collides + w * (1 - collides), (mi.Float(cell) + w) * width)
         number = dr.minimum(dr.select(warps, number, u), ONE_MINUS_EPSILON)
-        scatters = dr.select(warps, ~passes, cell < self._cells)
+        scatters = dr.select(warps, ~passes, u < collides)
         density = dr.select(scatters, of_cell, of_surface) / mean
         density = dr.select(mean > 0, density, 1)
         t = dr.select(scatters, dr.minimum(-dr.log(1 - number) / σ, si.t), si.t)

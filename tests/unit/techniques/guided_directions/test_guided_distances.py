@@ -53,6 +53,7 @@ CASES = {
     "thin": (0.1, 1.5, 2.0), "thick": (5.0, 1.5, 2.0), "dense": (1e4, 1.5, 2.0),
     "bright_surface": (0.5, 1.0, 100.0), "black_surface": (0.5, 1.0, 0.0),
     "unknown_surface": (0.5, 1.0, -1.0), "no_surface": (0.5, np.inf, -1.0),
+    "black_medium": (0.5, 1.0, -1.0), "black_medium_and_surface": (0.5, 1.0, 0.0),
 }  # fmt: skip
 
 
@@ -60,7 +61,8 @@ CASES = {
 def test_weighted_distances_have_the_density_of_transmittance(name: str) -> None:
     """In each of 64 intervals, and on the surface."""
     σ, end, surface = CASES[name]
-    t, scatters, weight = _flights(_distances(surface), σ, end)
+    albedo = 0.0 if name.startswith("black_medium") else 0.8
+    t, scatters, weight = _flights(_distances(surface), σ, end, albedo)
     assert np.isfinite(t[scatters]).all() and (t[scatters] >= 0).all() and (t <= end).all()
     assert weight.max() <= 1 / (1 - SHARE) + 1e-4 and weight.min() > 0
     through = np.exp(-σ * end)
