@@ -20,6 +20,9 @@ from ...util.arrays import channel_mean
 #: The number of voxels along each axis.
 RESOLUTION = 64
 
+#: The number of points of each voxel after each pilot at which direct light is computed.
+_POINTS = 4
+
 _VOXELS = RESOLUTION**3
 
 
@@ -71,7 +74,7 @@ class ScatteredLight:
 
 
 class DirectLight:
-    """Estimates what lamps send to each voxel, unscattered, from one point at a time.
+    """Estimates what lamps send to each voxel, unscattered.
 
     Parameters:
         box: The voxels.
@@ -98,7 +101,7 @@ class DirectLight:
         has_grids: bool,
         time: float,
     ) -> None:
-        """Adds a point of each voxel.
+        """Adds some points of each voxel.
 
         Parameters:
             query: How rays intersect the scene.
@@ -106,6 +109,10 @@ class DirectLight:
             has_grids: Whether there may be media that are not homogeneous.
             time: The time at which things that move are where light meets them.
         """
+        for _ in range(_POINTS):
+            self._add_point(scene, query, medium, has_grids, time)
+
+    def _add_point(self, scene, query, medium, has_grids, time) -> None:
         voxel = dr.arange(mi.UInt32, _VOXELS)
         first = dr.opaque(mi.UInt32, self.points * _VOXELS)
         numbers = HashedNumbers(voxel + first, dr.zeros(mi.UInt32, _VOXELS))
