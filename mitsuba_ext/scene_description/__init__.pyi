@@ -213,6 +213,7 @@ def composed_path(
     next_event: str | Plugin = "uniform",
     light_numbers: str = "uniform",
     roulette: str = "automatic",
+    flights: str = "automatic",
     connections: str | int | Plugin = "one",
     mis: str | Plugin = "power",
     shadow_test: str | Plugin = "always",
@@ -257,6 +258,8 @@ def composed_path(
             learned maps (see swarm_path). (Default: uniform)
         roulette (string): Which paths Russian roulette continues, from rr_depth on. throughput is
             the rule of path. (Default: automatic)
+        flights (string): How far paths fly in homogeneous media before they scatter. transmittance
+            is the choice of volpath. (Default: automatic)
         connections (string, int or decision): How many points on lights the first vertex of a path
             is connected to: one, a number (of points from a hammersley set), or a nested
             weighted_connections. (Default: one)
