@@ -40,6 +40,7 @@ VALUES = {
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
     "aovs": "d:depth", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
+    "flights": "transmittance",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "distance": "swarm",
     "light_numbers": "swarm", "scattering": "swarm", "caustics": "manifold",
     "pattern": "sobol",
