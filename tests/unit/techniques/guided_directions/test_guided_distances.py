@@ -57,7 +57,9 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", some("bright_surface", "no_surface", "black_medium", of=list(CASES))
+)
 def test_weighted_distances_have_the_density_of_transmittance(name: str) -> None:
     """In each of 64 intervals, and on the surface."""
     σ, end, surface = CASES[name]
@@ -126,3 +128,21 @@ def test_without_homogeneous_media_no_distances_are_learned(kind: str) -> None:
     integrator = mi.load_dict({"type": "pss_guided", "always_guide": True, "pilot_spp": 4})
     mi.render(scene, integrator=integrator, spp=16)
     assert set(integrator.learners) == {"directions", "roulette"}
+
+
+def test_learned_distances_are_kept_in_files(tmp_path) -> None:
+    scene, file = mi.load_dict(fog("area_inside")), str(tmp_path / "learned.npz")
+    found = []
+    for key in ("save_learned", "load_learned"):
+        how = {"always_guide": True, "pilot_spp": 4, key: file}
+        integrator = mi.load_dict({"type": "pss_guided", **how})
+        mi.render(scene, integrator=integrator, spp=16)
+        found.append(integrator.learners["flights"].decision)
+    saved, loaded = found
+    assert saved.light.values.numpy().max() > 0.1 and saved.surfaces.numpy().max() > 0
+    for name in ("values", "outside"):
+        expected = getattr(saved.light, name).numpy()
+        np.testing.assert_array_equal(getattr(loaded.light, name).numpy(), expected)
+    np.testing.assert_array_equal(loaded.surfaces.numpy(), saved.surfaces.numpy())
+    p = mi.Point3f(0.3, 0.1, -0.2)
+    assert (loaded.light.at(p).numpy() == saved.light.at(p).numpy()).all()
