@@ -11,6 +11,7 @@ from ..estimators.light_paths.choice import light_paths
 from ..estimators.light_paths.manifolds import parameters as manifolds
 from ..estimators.light_paths.subpath_choice import parameters as subpath_choice
 from ..planning.technique import ParameterReader, Technique
+from ..techniques.focal_points import parameters as focal_points
 from ..techniques.guided_directions import parameters as guided_directions
 from ..techniques.learned_lights import parameters as learned_lights
 from ..techniques.linear_lights import parameters as linear_lights
@@ -28,6 +29,7 @@ from ..util.errors import did_you_mean
 #: The techniques. Who deletes the folder of one deletes its row here, and its import.
 _TECHNIQUES: tuple[type[Technique], ...] = (
     *guided_directions.TECHNIQUES,
+    *focal_points.TECHNIQUES,
     *spatial_lights.TECHNIQUES,
     *linear_lights.TECHNIQUES,
     *tree_lights.TECHNIQUES,

@@ -1,0 +1,1 @@
+"""Directions to the places through which light passes."""
