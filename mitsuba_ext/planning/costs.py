@@ -31,6 +31,10 @@ FIRST_GUIDED, GUIDED, RAYS_PER_SEGMENT = 0.7, 0.25, 1.5
 #: The time of a sample with guided distances in media, relative to one without.
 GUIDED_FLIGHTS = 1.25
 
+#: The time of mixing directions to focal points with BSDF samples, and the time of each box, as
+#: shares of the time of a sample.
+FOCAL_CHOICE, FOCAL_BOX = 0.1, 0.004
+
 #: The candidates of resampled lights, and the connections to lights, that take about as long as a
 #: path.
 CANDIDATES_PER_PATH, CONNECTIONS_PER_PATH = 32, 16

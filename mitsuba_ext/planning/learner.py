@@ -44,6 +44,10 @@ class Learner(Observer):
     #: Whether it learns which lights a vertex sees (:meth:`shadow_test`).
     tells_visibility = False
 
+    #: Whether the last pilot has shown that the next stages have far less variance than the pilots
+    #: until now, so that these are left out of the image.
+    discards_pilots = False
+
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
         """The decision of the first pilot. ``p``, ``n``: vertices and normals that the scout has
         found, empty if no learner wants one."""

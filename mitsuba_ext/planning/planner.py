@@ -217,8 +217,13 @@ class Planner(Schedule):
             camera=self.decisions.camera,
             weight=self._weights[self._finished_stages],
             most_lanes=self._most_lanes,
+            discards_earlier=self._discards_pilots,
             observer=observer,
         )
+
+    @property
+    def _discards_pilots(self) -> bool:
+        return any(learner.discards_pilots for learner in self.learners.values())
 
     # ---- The trial ----
 
@@ -338,5 +343,6 @@ class Planner(Schedule):
         effects = {slot: learner.effect for slot, learner in everyone.items()}
         effects = {slot: effect.as_dict() for slot, effect in effects.items() if effect}
         return Stage(
-            estimator, learned, effects, camera=self.decisions.camera, most_lanes=most
-        )
+            estimator, learned, effects, camera=self.decisions.camera, most_lanes=most,
+            discards_earlier=self._discards_pilots,
+        )  # fmt: skip

@@ -1,115 +1,207 @@
-"""Learns focal points."""
+"""Learns focal points in pilots."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...planning import verdicts
+from ...planning.costs import FOCAL_BOX, FOCAL_CHOICE
 from ...planning.evidence import BATCHES, gain_of
 from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
-from ...scene.bounds import scene_bounds
+from ...scene.regions.nested_regions import NestedRegions
+from ...util.stored_arrays import StoredArrays
 from .decisions import FocalScattering
-from .fitting import fitted
-from .focal_boxes import FocalBoxes
-from .line_records import LineRecords
+from .fitting import LineArrays, fitted_boxes, fitted_rows
+from .focal_density import FocalDensity
+from .line_records import LineRecords, Lines
 
-MOST_LINES = 8192
+#: The lines from which boxes are fitted, and the probabilities of each region.
+_BOX_LINES, _REGION_LINES = 1 << 12, 1 << 15
+
+#: The largest weight of a line, relative to the mean.
+_HEAVIEST = 64.0
+
+#: The most regions.
+_MOST_REGIONS = 1 << 10
+
+#: The largest factor by which a BSDF sample is thought to be rarer than a line that was found.
+_RAREST = 1e6
 
 
 class FocalLearner(Learner):
-    def __init__(self, bounces, stride, film_size, always=False):
-        self._bounces, self.always = bounces, always
-        self._pixels = PixelEstimates(*film_size)
-        self._records = LineRecords(bounces, stride, self._pixels)
-        self.decision = None
-        self._summary = "no focal points"
+    """Learns focal points. The second pilot draws directions to what the first one has found, and
+    measures what that gains.
 
-    def start(self, scene, p, n):
-        box = scene_bounds(scene)
-        self._bounds = np.array(box.min, np.float64), np.array(box.max, np.float64)
-        low, high = self._bounds
-        self.decision = FocalScattering(FocalBoxes(low[None], high[None] + 1e-6, np.ones(1)), 0.0)
+    Parameters:
+        boxes: The most boxes.
+        bounces: How many bounces of a path are recorded.
+        least: The least number of the scout's vertices in a region.
+        pilot_samples: Samples of all pilots together.
+        film_size: Width and height of the film in pixels, with its border where that is sampled.
+        always: Draw such directions also where that does not pay?
+
+    Attributes:
+        decision (FocalScattering): The decision of the next stage; ``None`` for the one of
+            ``path``.
+    """
+
+    wants_scout = True
+
+    def __init__(
+        self,
+        boxes: int,
+        bounces: int,
+        least: float,
+        pilot_samples: int,
+        film_size: tuple[int, int],
+        always: bool = False,
+    ) -> None:
+        self._boxes, self._bounces, self._least = boxes, bounces, least
+        self._pilot_samples, self._always = pilot_samples, always
+        self._pixels, self._records = PixelEstimates(*film_size), None
+        self.decision: FocalScattering | None = None
+        self._effect: Effect | None = None
+        self.discards_pilots = False
+        self._summary = "no focal points: no path scatters"
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> FocalScattering | None:
+        if dr.width(p) == 0:
+            return None
+        regions = NestedRegions(p, n, self._least, _MOST_REGIONS)
+        # As ``path``, but with the kernel of the pilots that follow
+        self.decision = FocalScattering(FocalDensity.nothing(regions.count), regions)
+        self._records = LineRecords(self.decision.region, self._bounces, self._pixels)
         return self.decision
 
-    def kernel_state(self):
-        return [self._records]
+    # ---- Observer ----
 
-    def begin(self, *a): self._records.begin(*a)
-    def direction(self, *a): self._records.direction(*a)
-    def scattering(self, *a): self._records.scattering(*a)
-    def end(self, L): self._records.end(L)
+    def kernel_state(self) -> list[Any]:
+        """The attributes on which kernels depend (``frozen.py``)."""
+        return [] if self._records is None else [self._records]
 
-    def learn(self, pilot: Pilot):
-        import time
-        t0 = time.time()
+    def begin(self, *arguments: Any) -> None:
+        if self._records is not None:
+            self._records.begin(*arguments)
+
+    def direction(self, *arguments: Any) -> None:
+        if self._records is not None:
+            self._records.direction(*arguments)
+
+    def scattering(self, *arguments: Any) -> None:
+        if self._records is not None:
+            self._records.scattering(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        if self._records is not None:
+            self._records.end(L)
+
+    # ---- Between the stages ----
+
+    def learn(self, pilot: Pilot) -> FocalScattering | None:
+        self.discards_pilots = False
         records = self._records
-        records.finish()
-        lines = records.lines
-        if lines is None:
+        if records is None:
             return self.decision
-        share, boxes = self.decision.share, self.decision.boxes
-        focus = boxes.density(lines.p, lines.d, mi.Bool(True))
-        n = dr.width(lines.pdf)
-        new = n - records.first_new
-        # density of the BSDF
-        s = dr.opaque(mi.Float, share)
-        if not hasattr(self, "bsdf"):
-            self.bsdf = mi.Float()
-        index = dr.arange(mi.UInt32, new) + records.first_new
-        b = dr.maximum((dr.gather(mi.Float, lines.pdf, index) - s * dr.gather(mi.Float, focus, index)) / (1 - s), 0)
-        self.bsdf = dr.concat([self.bsdf, b]) if len(self.bsdf) else b
-        dr.eval(self.bsdf)
-        v = lines.value.numpy()
-        pdf, bs, batch = lines.pdf.numpy(), self.bsdf.numpy(), lines.batch.numpy()
-        # effect of the last stage
-        if share > 0 and new:
-            i = slice(records.first_new, None)
-            sq = v[i].astype(float)**2
-            ratio = np.minimum(pdf[i] / np.maximum(bs[i], 1e-9), 1e6)
-            more = np.bincount(batch[i], sq * (ratio - 1), BATCHES)
-            gain, err = gain_of(np.stack([records.variances, more]))
-            print(f"   measured gain {gain:.3f} ± {err:.2f}; variance left {1-gain:.3f}")
-        import os
-        if os.environ.get("DBG"):
-            import sys; sys.path.insert(0,"/tmp/FOCAL"); import patch; patch.debug(records, lines, bs, boxes, share)
-        # weights
-        c = v.astype(float)
-        cap = 64 * c.mean()
-        c = np.minimum(c, cap)
-        cum = np.cumsum(c) / c.sum()
-        m = min(MOST_LINES, n)
-        pick = np.minimum(np.searchsorted(cum, (np.arange(m) + 0.5) / m), n - 1)
-        pick, times = np.unique(pick, return_counts=True)
-        P = lines.p.numpy().T[pick]; D = lines.d.numpy().T[pick]
-        low, high, a, new_share = fitted(self._bounds, P, D, bs[pick].astype(np.float32), times.astype(np.float32), lambda *x: print("   ", *x))
+        lines = records.lines()
+        if lines is None:
+            if pilot.is_last:
+                self._summary = "no focal points: no path has found light"
+                self.decision = self._records = None
+            records.restart()
+            return self.decision
+        bsdf = self._bsdf_density(lines)
+        if self.decision.density.table[:, 0].any():
+            gain, error = self._gain(lines, bsdf)
+            known = records.paths / self._pilot_samples
+            time = 1 + FOCAL_CHOICE + FOCAL_BOX * self.decision.density.count
+            self.discards_pilots = self._effect is None and 1 - gain < verdicts.FAR_LESS
+            self._effect = Effect(True, max(1 - gain, 1e-3), time)
+            prediction = Prediction(1 - gain, time, error, known, True)
+            if not (self._always or pilot.pays(prediction)):
+                self._effect = Effect(False, max(1 - gain, 1e-3), time)
+                self._summary = f"no focal points: about {max(gain, 0):.0%} less variance"
+                self.decision = self._records = None
+                return None
+        self._fit(lines, bsdf)
         records.restart()
-        share = min(max(new_share, 0.0), 0.9)
-        self.decision = FocalScattering(FocalBoxes(low, high, a), share)
-        self._summary = f"{len(a)} boxes, share {share:.2f}"
-        print("   ", n, "lines", self._summary, f"{time.time()-t0:.2f} s")
         return self.decision
 
-    def state(self):
-        b = self.decision.boxes
-        return {"low": b.low, "high": b.high, "weight": b.weight.astype(np.float32), "share": np.float32(self.decision.share)}
+    def _bsdf_density(self, lines: Lines) -> mi.Float:
+        """The densities of the lines among BSDF samples, from their densities in the mixture."""
+        density, active = self.decision.density, mi.Bool(True)
+        share = density.share(lines.region, active)
+        focus = density.density(lines.region, lines.p, lines.d, active)
+        bsdf = (lines.pdf - share * focus) / (1 - share)
+        # What is left by rounding may be negative
+        bsdf = dr.maximum(bsdf, lines.pdf / _RAREST)
+        dr.eval(bsdf)
+        return bsdf
 
-    def restore(self, scene, state):
-        low = state.take("low", "f", (None, 3), longest=1 << 20)
-        n = len(low)
-        high = state.take("high", "f", (n, 3))
-        w = state.take("weight", "f", (n,))
-        self.decision = FocalScattering(FocalBoxes(low, high, w), float(state.take("share", "f", (), 0, 1)))
+    def _gain(self, lines: Lines, bsdf: mi.Float) -> tuple[float, float]:
+        """By how much focal points have reduced the variance of the last pilot, to first order in
+        the vertices of a path; and the error of this estimate, see :func:`gain_of`."""
+        more = dr.square(mi.Float64(lines.value)) * mi.Float64(lines.pdf / bsdf - 1)
+        more = np.nan_to_num(more.numpy(), posinf=0.0, neginf=0.0)
+        sums = np.bincount(lines.batch.numpy(), more, BATCHES)
+        return gain_of(np.stack([self._records.variances, sums]))
+
+    def _fit(self, lines: Lines, bsdf: mi.Float) -> None:
+        value = lines.value.numpy().astype(np.float64)
+        value = np.minimum(value, _HEAVIEST * value.mean())
+        low, high, probability = fitted_boxes(_chosen(lines, bsdf, value, _BOX_LINES), self._boxes)
+        regions = self.decision.regions
+        if len(low) == 0:
+            density = FocalDensity.nothing(regions.count)
+        else:
+            some = _chosen(lines, bsdf, value, _REGION_LINES)
+            rows = fitted_rows(some, low, high, probability, regions.levels, regions.parent)
+            density = FocalDensity(low, high, rows)
+        self.decision = FocalScattering(density, regions)
+        self._summary = f"focal points: {len(low)} boxes, {regions.count} regions"
+
+    def state(self) -> dict[str, np.ndarray]:
+        if self.decision is None:
+            return {}
+        return {**self.decision.density.state(), **_prefixed(self.decision.regions.state())}
+
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> FocalScattering:
+        regions = NestedRegions.of_state(state.part("regions/"))
+        density = FocalDensity.of_state(state, regions.count)
+        self.decision = FocalScattering(density, regions)
+        self._summary = f"focal points: {density.count} boxes, {regions.count} regions"
         return self.decision
 
-    def finish(self):
+    def finish(self) -> None:
         self._records = None
 
     @property
-    def effect(self):
-        return Effect(True)
+    def effect(self) -> Effect | None:
+        return self._effect
 
-    def __str__(self):
-        return self._summary
+    def __str__(self) -> str:
+        if self._effect is None or self.decision is None:
+            return self._summary
+        return f"{self._summary}, about {1 - self._effect.variance:.0%} less variance"
+
+
+def _chosen(lines: Lines, bsdf: mi.Float, value: np.ndarray, most: int) -> LineArrays:
+    """At most ``most`` of the lines, chosen by the light that was found along them."""
+    running = np.cumsum(value) / value.sum()
+    count = min(most, len(value))
+    index = np.searchsorted(running, (np.arange(count) + 0.5) / count)
+    index, times = np.unique(np.minimum(index, len(value) - 1), return_counts=True)
+    where = mi.UInt32(index.astype(np.uint32))
+    p, d = (dr.gather(type(x), x, where).numpy().T.astype(np.float64) for x in (lines.p, lines.d))
+    region = dr.gather(mi.UInt32, lines.region, where).numpy()
+    density = dr.gather(mi.Float, bsdf, where).numpy().astype(np.float64)
+    return LineArrays(p, d, region, density, times.astype(np.float64))
+
+
+def _prefixed(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"regions/{key}": value for key, value in state.items()}

@@ -1,8 +1,9 @@
-"""Records the directions of the paths of pilots, and the light that they have found there."""
+"""Records the directions of the paths of a pilot, and the light that was found there."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -11,66 +12,96 @@ import numpy as np
 from ...planning.evidence import BATCHES
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
+from ...transport.vertex import Vertex
 from ...util.arrays import joined
 from .decisions import is_smooth
+
+#: The most paths of a pass that are recorded. Of the paths of a stage, four times as many.
+_MOST_PATHS = 1 << 18
 
 
 @dataclass
 class Lines:
-    """One entry for each direction in which a path found light.
+    """An entry for each direction in which a path has found light.
 
     Attributes:
-        p, d: The vertex and the direction.
+        p, d: The vertex, and the direction.
+        region: The region of the vertex.
         pdf: The density with which the direction was sampled.
-        value: What the path gained after the vertex, relative to its pixel.
+        value: What the path gained after the vertex, relative to the radiance of its pixel.
         batch: The batch of paths (``evidence.py``).
     """
 
     p: mi.Point3f
     d: mi.Vector3f
+    region: mi.UInt32
     pdf: mi.Float
     value: mi.Float
     batch: mi.UInt32
 
 
 class LineRecords(Observer):
-    def __init__(self, bounces: int, stride: int, pixels: PixelEstimates) -> None:
-        self.bounces, self.stride, self._pixels = bounces, stride, pixels
+    """Records the first bounces of paths.
+
+    Parameters:
+        region: Finds the region of a vertex.
+        bounces: Number of bounces of a path that are recorded.
+        pixels: Receives the radiance of the paths.
+
+    Attributes:
+        paths (int): How many paths of the stage were recorded.
+        variances (numpy.ndarray): Sums over these paths of their squared errors, relative to the
+            squared radiance of their pixels; shape [batches].
+    """
+
+    def __init__(
+        self,
+        region: Callable[[Vertex, mi.Bool], mi.UInt32],
+        bounces: int,
+        pixels: PixelEstimates,
+    ) -> None:
+        self._region, self.bounces, self._pixels = region, bounces, pixels
         self._lanes = 0
-        self._passes: list[Lines] = []
         self.restart()
 
     def restart(self) -> None:
+        """Forgets all records: a stage begins."""
+        self._passes: list[Lines] = []
         self.paths, self.variances = 0, np.zeros(BATCHES)
-        self.first_new = self.count
 
-    @property
-    def count(self) -> int:
-        return dr.width(self._passes[0].pdf) if self._passes else 0
+    def lines(self) -> Lines | None:
+        """The records of the stage; ``None`` if no path has found light."""
+        self._collect()
+        return joined(self._passes) if self._passes else None
 
     def kernel_state(self) -> tuple:
+        """The attributes on which kernels depend (``frozen.py``)."""
         return (
-            self._pixel, self._path, self._is_recorded, self._slots, self._p, self._d, self._pdf,
-            self._before, self._total,
+            self._region, self.bounces, self._path, self._is_recorded, self._slots,
+            self._p, self._d, self._where, self._pdf, self._before, self._total,
         )  # fmt: skip
 
-    def begin(self, lanes, pixel) -> None:
+    # ---- Observer of the walk ----
+
+    def begin(self, lanes: int, pixel: mi.UInt32) -> None:
         self._collect()
-        self._lanes = -(-lanes // self.stride)
-        self._pixel = pixel
-        lane = dr.arange(mi.UInt32, lanes)
-        stride = dr.opaque(mi.UInt32, self.stride)
+        most = min(_MOST_PATHS, max(1, _MOST_PATHS - self.paths // 4))
+        self._stride = -(-lanes // most)
+        self._lanes, self._pixel = -(-lanes // self._stride), pixel
+        lane, stride = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, self._stride)
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         slots = self._lanes * self.bounces
         self._p, self._d = dr.zeros(mi.Point3f, slots), dr.zeros(mi.Vector3f, slots)
-        self._pdf = dr.zeros(mi.Float, slots)
+        self._where, self._pdf = dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots)
+        # What was not recorded has gained nothing
         self._before = dr.full(mi.Float, dr.inf, slots)
         self._total = dr.zeros(mi.Float, self._lanes)
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         dr.eval(
-            self._path, self._is_recorded, self._p, self._d, self._pdf, self._before, self._total
-        )
+            self._path, self._is_recorded, self._p, self._d, self._where, self._pdf, self._before,
+            self._total,
+        )  # fmt: skip
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         slot, active = self._slot(vertex, active)
@@ -81,48 +112,46 @@ class LineRecords(Observer):
         active &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         dr.scatter(self._p, vertex.si.p, slot, active)
         dr.scatter(self._d, vertex.si.to_world(bs.wo), slot, active)
+        dr.scatter(self._where, self._region(vertex, active), slot, active)
         dr.scatter(self._pdf, bs.pdf, slot, active)
 
-    def _slot(self, vertex, active):
+    def _slot(self, vertex: Vertex, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         active = active & self._is_recorded & (vertex.depth < self.bounces) & is_smooth(vertex)
         return vertex.depth * self._slots + self._path, active
 
-    def end(self, L) -> None:
+    def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
 
-    def finish(self) -> None:
-        self._collect()
-        if self._passes:
-            self._passes = [joined(self._passes)]
-
-    @property
-    def lines(self) -> Lines | None:
-        return self._passes[0] if self._passes else None
+    # ---- Between passes ----
 
     def _collect(self) -> None:
+        """Keeps what the last pass has recorded."""
         if self._lanes == 0:
             return
-        recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self.stride)
+        recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self._stride)
         pixel = dr.gather(mi.UInt32, self._pixel, recorded)
         self._pixels.add(pixel, self._total)
         importance, error = self._pixels.importance(pixel, self._total)
         self.paths += self._lanes
-        batch = dr.arange(mi.UInt32, self._lanes) % BATCHES
-        e, b = error.numpy().astype(np.float64), batch.numpy()
-        self.variances += np.bincount(b, np.nan_to_num(e, posinf=0), BATCHES)
+        error = np.nan_to_num(error.numpy().astype(np.float64), posinf=0.0)
+        self.variances += np.bincount(np.arange(len(error)) % BATCHES, error, BATCHES)
         self._lanes = 0
         slot = dr.arange(mi.UInt32, len(self._pdf))
-        path = slot % self._slots
-        value = dr.gather(mi.Float, self._total, path) - self._before
-        slot = dr.compress((value > 0) & (self._pdf > 0) & dr.isfinite(value) & dr.isfinite(self._pdf))
+        value = dr.gather(mi.Float, self._total, slot % self._slots) - self._before
+        found = (value > 0) & dr.isfinite(value) & (self._pdf > 0) & dr.isfinite(self._pdf)
+        slot = dr.compress(found)
         if len(slot):
             path = slot % self._slots
-            value = dr.gather(mi.Float, self._total, path) - dr.gather(mi.Float, self._before, slot)
+            value = dr.gather(mi.Float, self._total, path) - dr.gather(
+                mi.Float, self._before, slot
+            )
+            scale = dr.sqrt(dr.gather(mi.Float, importance, path))
             lines = Lines(
                 dr.gather(mi.Point3f, self._p, slot), dr.gather(mi.Vector3f, self._d, slot),
-                dr.gather(mi.Float, self._pdf, slot),
-                value * dr.sqrt(dr.gather(mi.Float, importance, path)), path % BATCHES,
-            )
+                dr.gather(mi.UInt32, self._where, slot), dr.gather(mi.Float, self._pdf, slot),
+                value * scale, path % BATCHES,
+            )  # fmt: skip
             dr.eval(lines)
             self._passes.append(lines)
-        self._p = self._d = self._pdf = self._before = self._total = self._pixel = None
+        self._p = self._d = self._where = self._pdf = self._before = self._total = None
+        self._pixel = None
