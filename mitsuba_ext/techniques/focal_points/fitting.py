@@ -24,7 +24,7 @@ _FIRST, _DIVISIONS = 8, 4
 _MARGIN, _OUTSIDE = 0.15, 0.01
 
 #: Steps of expectation maximization after each division, and in each level of regions.
-_STEPS, _REGION_STEPS = 12, 12
+_STEPS, _REGION_STEPS = 10, 10
 
 #: Boxes of a smaller probability are left out.
 _LEAST = 2e-3
@@ -100,7 +100,7 @@ def fitted_rows(
         levels, parent: See :class:`~mitsuba_ext.scene.regions.nested_regions.NestedRegions`.
     """
     densities = _densities(low, high, lines)
-    rows = np.zeros((levels[-1].stop, len(low) + 1))
+    rows = np.zeros((levels[-1].stop, len(low) + 1), np.float32)
     rows[:] = np.concatenate([[1 - probability.sum()], probability])
     ancestor = lines.region.astype(np.int64)
     chain = []
@@ -114,7 +114,7 @@ def fitted_rows(
         here = np.flatnonzero(is_here)
         if len(here) == 0:
             continue
-        prior = _PRIOR * (rows[parent[level]] if level.start else rows[level])
+        prior = np.float32(_PRIOR) * (rows[parent[level]] if level.start else rows[level])
         place = region[here] - level.start
         order = np.argsort(place, kind="stable")
         here, place = here[order], place[order]
@@ -147,21 +147,30 @@ def _first_boxes(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _densities(low: np.ndarray, high: np.ndarray, lines: LineArrays) -> np.ndarray:
     """The density of each line among BSDF samples, and among directions to each box; shape
     [lines, 1 + boxes]."""
-    inverse = 1 / np.where(np.abs(lines.d) > 1e-12, lines.d, 1e-12)
-    enters, leaves = np.zeros((2, len(lines.p), len(low)))
-    leaves += np.inf
+    # In single precision, in place: these are the largest arrays
+    low, high, p = (np.float32(x) for x in (low, high, lines.p))
+    inverse = 1 / np.where(np.abs(lines.d) > 1e-12, lines.d, np.float32(1e-12))
+    enters = np.zeros((len(p), len(low)), np.float32)
+    leaves = np.full_like(enters, np.inf)
     for axis in range(3):
-        a = (low[:, axis] - lines.p[:, axis, None]) * inverse[:, axis, None]
-        b = (high[:, axis] - lines.p[:, axis, None]) * inverse[:, axis, None]
+        a, b = (x[:, axis] - p[:, axis, None] for x in (low, high))
+        a *= inverse[:, axis, None]
+        b *= inverse[:, axis, None]
         np.maximum(enters, np.minimum(a, b), out=enters)
-        np.minimum(leaves, np.maximum(a, b), out=leaves)
-    cubes = np.where(leaves > enters, leaves**3 - enters**3, 0)
-    of_boxes = cubes / (3 * np.prod(high - low, axis=1))
-    return np.column_stack([lines.bsdf, of_boxes])
+        np.minimum(leaves, np.maximum(a, b, out=b), out=leaves)
+    cubes = leaves - enters
+    crosses = cubes > 0
+    leaves *= leaves + enters
+    leaves += enters * enters
+    cubes *= leaves
+    cubes *= crosses
+    cubes *= np.float32(1 / (3 * np.prod(high - low, axis=1, dtype=np.float64)))
+    return np.column_stack([lines.bsdf, cubes])
 
 
 def _maximized(densities: np.ndarray, weight: np.ndarray, probability: np.ndarray) -> np.ndarray:
     """The probabilities after some steps of expectation maximization."""
+    probability = np.float32(probability)
     for _ in range(_STEPS):
         share = weight / np.maximum(densities @ probability, 1e-30)
         probability = probability * (share @ densities)

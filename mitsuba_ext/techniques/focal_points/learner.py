@@ -22,7 +22,7 @@ from .focal_density import FocalDensity
 from .line_records import LineRecords, Lines
 
 #: The lines from which boxes are fitted, and the probabilities of each region.
-_BOX_LINES, _REGION_LINES = 1 << 12, 1 << 15
+_BOX_LINES, _REGION_LINES = 1 << 11, 1 << 14
 
 #: The largest weight of a line, relative to the mean.
 _HEAVIEST = 64.0
@@ -197,10 +197,10 @@ def _chosen(lines: Lines, bsdf: mi.Float, value: np.ndarray, most: int) -> LineA
     index = np.searchsorted(running, (np.arange(count) + 0.5) / count)
     index, times = np.unique(np.minimum(index, len(value) - 1), return_counts=True)
     where = mi.UInt32(index.astype(np.uint32))
-    p, d = (dr.gather(type(x), x, where).numpy().T.astype(np.float64) for x in (lines.p, lines.d))
+    p, d = (dr.gather(type(x), x, where).numpy().T for x in (lines.p, lines.d))
     region = dr.gather(mi.UInt32, lines.region, where).numpy()
-    density = dr.gather(mi.Float, bsdf, where).numpy().astype(np.float64)
-    return LineArrays(p, d, region, density, times.astype(np.float64))
+    density = dr.gather(mi.Float, bsdf, where).numpy()
+    return LineArrays(p, d, region, density, times.astype(np.float32))
 
 
 def _prefixed(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
