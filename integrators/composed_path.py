@@ -35,10 +35,11 @@ class ComposedPath(WalkIntegrator):
          maps as in :monosp:`swarm_path` choose between reflection and transmission. (Default:
          uniform)
      * - scattering
-       - |string|
-       - What samples the next direction of a path: the :monosp:`bsdf`; with :monosp:`swarm`, also
-         learned maps, at the first vertex that is not a mirror (see :monosp:`swarm_path`).
-         (Default: bsdf)
+       - |string| or |decision|
+       - What samples the next direction of a path: the :monosp:`bsdf`; with :monosp:`focal` or a
+         nested :monosp:`focal_points`, also learned places through which light passes, such as
+         keyholes and slits; with :monosp:`swarm`, also learned maps, at the first vertex that is
+         not a mirror (see :monosp:`swarm_path`). (Default: bsdf)
      * - next_event
        - |string| or |decision|
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
@@ -99,7 +100,8 @@ class ComposedPath(WalkIntegrator):
          :monosp:`conductor` without bump, normal or opacity map; other surfaces, instances, and
          scenes that move or disperse light are left to scattering. Light of points and directions
          that passes more than two surfaces is missing, as with :monosp:`scattered`. It refuses
-         participating media and :monosp:`scattering=swarm`. (Default: scattered)
+         participating media, and other :monosp:`scattering` than :monosp:`bsdf`. (Default:
+         scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a
@@ -118,8 +120,8 @@ class ComposedPath(WalkIntegrator):
          samples (half, if only :monosp:`swarm` learns). They count towards the image. The parameter
          is accepted only if a decision learns. With 0, nothing is learned. With a stratified
          sampler, pilots consist of whole passes, and can be longer. (Default: 64 with
-         :monosp:`swarm`, 32 with guided directions, 4 if only :monosp:`triple_product` learns,
-         otherwise 16)
+         :monosp:`swarm`, 32 with guided directions or focal points, 4 if only
+         :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With

@@ -135,7 +135,7 @@ def fitted_rows(
 def _first_boxes(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The corners of cubes around all vertices, except for outliers."""
     low, high = np.quantile(p, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-    size = max((high - low).max(), 1e-6 * np.abs(p).max(), 1e-30)
+    size = max((high - low).max(), 1e-4 * np.abs(p).max(), 1e-6)
     low, high = low - _MARGIN * size, high + _MARGIN * size
     edge = (high - low).max() / _FIRST
     counts = np.maximum(np.ceil((high - low) / edge - 1e-6), 1).astype(int)

@@ -1,0 +1,137 @@
+"""Focal points: the density of directions that lead there, and how lines show where they are."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
+from mitsuba_ext.techniques.focal_points.fitting import LineArrays, fitted_boxes, fitted_rows
+from mitsuba_ext.techniques.focal_points.focal_density import FocalDensity
+from tests.support.statistical import load
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: Two boxes that overlap, one that is thin, and one behind the origin; the row that is used chooses
+#: 0.6 of its samples among three of them.
+LOW = np.array([[1, -0.5, -0.5], [0.5, 0, -1], [-1, 2, -2], [-3, -1, -1]])
+HIGH = np.array([[2, 0.5, 0.5], [1.5, 1, 1], [1, 2.1, 2], [-1, 1, 0.5]])
+ROWS = np.array([[0, 0, 0, 0], [0.1, 0.3, 0.2, 0]])
+
+#: A region for all vertices, as :class:`NestedRegions` has them.
+ALL = SimpleNamespace(number=lambda p, n, active: mi.UInt32(1))
+
+
+@pytest.mark.parametrize("p", [(0, 0, 0), (1.2, 0.2, 0.1)], ids=["outside", "inside"])
+def test_directions_to_boxes_have_their_density(p: tuple[float, ...]) -> None:
+    density, row, active = FocalDensity(LOW, HIGH, ROWS), mi.UInt32(1), mi.Bool(True)
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=lambda u: density.sample(row, mi.Point3f(p), u.x, mi.Point2f(u.y, u.z), active),
+        pdf_func=lambda d: density.density(row, mi.Point3f(p), d, active),
+        sample_dim=3, sample_count=1 << 18, res=60, ires=8,
+    )  # fmt: skip
+    assert test.run(0.01), test.messages
+    np.testing.assert_allclose(density.share(row, active).numpy(), 0.6, rtol=1e-6)
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(np.random.default_rng(1).random((2, 999))))
+    both = density.densities(row, mi.Point3f(p), d, -d, active)
+    for found, direction in zip(both, (d, -d)):
+        expected = density.density(row, mi.Point3f(p), direction, active)
+        np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=1e-5)
+
+
+def _vertex(bsdf: dict, count: int) -> SimpleNamespace:
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(0.8, 0.4, 0.4))))
+    si.n, si.wi = si.sh_frame.n, dr.normalize(mi.Vector3f(0.5, -0.3, 0.8))
+    plugin = mi.load_dict(bsdf)
+    return SimpleNamespace(si=si, bsdf=mi.BSDFPtr(plugin), held=plugin, medium=None)
+
+
+@pytest.mark.parametrize("bsdf", [
+    {"type": "roughplastic", "alpha": 0.3},
+    {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"}, "b": {"type": "conductor"}},
+], ids=lambda bsdf: bsdf["type"])  # fmt: skip
+def test_the_mixture_has_its_density_and_the_mean_of_the_bsdf(bsdf: dict) -> None:
+    count, ctx = 1 << 17, mi.BSDFContext()
+    focal = FocalScattering(FocalDensity(LOW, HIGH, ROWS), ALL)
+    vertex = _vertex(bsdf, count)
+    rng = mi.PCG32(size=count)
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    wo = mi.warp.square_to_uniform_hemisphere(v)
+    value, pdf, bs, weight, _ = focal.sample(None, ctx, vertex, wo, u, v)
+    of_bsdf, bsdf_pdf = vertex.bsdf.eval_pdf(ctx, vertex.si, wo)
+    d = vertex.si.to_world(wo)
+    to_focus = focal.density.density(mi.UInt32(1), vertex.si.p, d, mi.Bool(True))
+    np.testing.assert_allclose(pdf.numpy(), (0.4 * bsdf_pdf + 0.6 * to_focus).numpy(), rtol=1e-4)
+    np.testing.assert_allclose(value.numpy(), of_bsdf.numpy(), rtol=1e-5)
+    # The density of a sample is the one that MIS weights expect of its direction
+    smooth = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    _, expected = focal.eval_pdf(None, ctx, vertex, bs.wo, smooth)
+    is_close = np.isclose(bs.pdf.numpy(), expected.numpy(), rtol=1e-3)
+    assert is_close[smooth.numpy()].mean() > 0.999  # others at the edge of a box
+    # Means of a function of the direction
+    def mean(weight, wo):
+        seen = (weight.x * (1 + dr.square(vertex.si.to_world(wo).x))).numpy().astype(float)
+        return seen.mean(), seen.std() / np.sqrt(count)
+
+    found, error = mean(weight, bs.wo)
+    alone, weight = vertex.bsdf.sample(ctx, vertex.si, u, v)
+    exact, other = mean(weight, alone.wo)
+    assert abs(found - exact) < 4 * np.hypot(error, other) < 0.04 * exact
+
+
+def _lines(count: int, hole: np.ndarray, size: float) -> LineArrays:
+    """Lines from the walls of a room of 4 m through a hole in one of them."""
+    rng = np.random.default_rng(3)
+    p = rng.uniform(-2, 2, (count, 3))
+    p[np.arange(count), rng.integers(0, 2, count)] = -2  # on two walls
+    target = hole + rng.uniform(-size / 2, size / 2, (count, 3)) * [0, 1, 1]
+    d = target - p
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    region = 1 + (p[:, 0] > 0)
+    one = np.ones(count, np.float32)
+    return LineArrays(np.float32(p), np.float32(d), region, 0.2 * one, one)
+
+
+def test_boxes_are_found_where_lines_cross() -> None:
+    hole, size = np.array([2, 0.3, 0.8]), 0.1
+    lines = _lines(600, hole, size)
+    low, high, probability = fitted_boxes(lines, 32)
+    assert len(low) <= 32 and probability.sum() < 1
+    edge, middle = (high - low).max(axis=1), (low + high) / 2
+    is_near = (np.abs(middle - hole) < size + edge[:, None]).all(axis=1) & (edge < 0.3)
+    assert probability[is_near].sum() > 0.7
+    rows = fitted_rows(
+        lines, low, high, probability, [slice(0, 1), slice(1, 3)], np.array([0, 0, 0])
+    )
+    assert rows.shape == (3, len(low))
+    # BSDF samples keep their part
+    assert (rows.sum(axis=1) < 0.8 + 1e-6).all() and (rows[:, is_near].sum(axis=1) > 0.6).all()
+
+
+def test_one_line_and_equal_points_give_boxes() -> None:
+    for count, spread in ((1, 1), (5, 0)):
+        lines = _lines(count, np.array([2, 0, 0]), 0.1)
+        lines = lines._replace(p=lines.p * np.float32(spread))
+        low, high, probability = fitted_boxes(lines, 4)
+        assert (high > low).all() and np.isfinite(probability).all()
+
+
+@pytest.mark.slow
+def test_light_through_a_keyhole_is_found() -> None:
+    """Directions lead to the keyhole, and the unguided pilots do not count towards the image."""
+    scene = load("keyhole", width=64, height=36, rfilter="box")
+    integrator = mi.load_dict({"type": "composed_path", "scattering": "focal", "max_depth": 5})
+    integrator.render(scene, spp=128, seed=1)
+    learner = integrator.learners["scattering"]
+    density = learner.decision.density
+    middle = (density.low + density.high) / 2
+    is_near = (np.abs(middle - [-1.15, 0.7, 1.1]) < [0.3, 0.2, 0.3]).all(axis=1)
+    weight = np.diff(density.table[0, 1:], prepend=0)
+    assert weight[is_near].sum() > 0.5, integrator.statistics.learned
+    assert learner.effect.variance < 0.4
