@@ -209,7 +209,7 @@ def bdpt(
 def composed_path(
     *,
     directions: str | Plugin = "uniform",
-    scattering: str = "bsdf",
+    scattering: str | Plugin = "bsdf",
     next_event: str | Plugin = "uniform",
     light_numbers: str = "uniform",
     roulette: str = "automatic",
@@ -249,8 +249,10 @@ def composed_path(
     Parameters:
         directions (string or decision): Which random numbers choose the next direction of a path:
             uniform numbers, guided numbers, or a nested guided_directions. (Default: uniform)
-        scattering (string): What samples the next direction of a path: the bsdf; with swarm, also
-            learned maps, at the first vertex that is not a mirror (see swarm_path). (Default: bsdf)
+        scattering (string or decision): What samples the next direction of a path: the bsdf; with
+            focal or a nested focal_points, also learned places through which light passes, such as
+            keyholes and slits; with swarm, also learned maps, at the first vertex that is not a
+            mirror (see swarm_path). (Default: bsdf)
         next_event (string or decision): Which light a vertex is connected to, and which point of
             it. (Default: uniform)
         light_numbers (string): Which random numbers choose the light and the point on it, at the
@@ -277,7 +279,7 @@ def composed_path(
             homogeneous medium. (Default: sampler)
         pilot_spp (int): Number of pilot samples per pixel, from which decisions learn; at most a
             quarter of all samples (half, if only swarm learns). (Default: 64 with swarm, 32 with
-            guided directions, 4 if only triple_product learns, otherwise 16)
+            guided directions or focal points, 4 if only triple_product learns, otherwise 16)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -1523,6 +1525,26 @@ def faure(
         seed (int): Added to the seed of the render. (Default: 0)
         dimensions (int): Number of dimensions that are stratified together: 2, 4, 6 or 8. (Default:
             4)
+    """
+
+
+def focal_points(
+    *,
+    boxes: int = 32,
+    always_use: bool = False,
+    id: str = ...,
+) -> dict[str, Any]:
+    """Focal points (focal_points).
+
+    A decision for the slot scattering of composed_path. It learns from the first samples where in
+    space light passes: keyholes, slits, gaps of doors, windows, bright spots, and the real and
+    virtual images behind lenses and mirrors. A share of the directions of a path then lead there,
+    and the BSDF samples the others. It is unbiased, and needs no knowledge of portals.
+
+    Parameters:
+        boxes (int): The most boxes that stand for these places, up to 256. (Default: 32)
+        always_use (bool): Whether directions lead to focal points even if the pilots show that this
+            does not pay. (Default: false)
     """
 
 

@@ -40,6 +40,7 @@ LEARNED: dict[str, dict[str, Any]] = {
     "tiles": {
         "type": "composed_path",
         "directions": {"type": "guided_directions", "regions": "tiles", "always_guide": True},
+        "scattering": {"type": "focal_points", "always_use": True},
     },
     "maps": {"type": "swarm_path", "always_use": True},
     "two stages": {"type": "two_stage", "visibility": "world"},

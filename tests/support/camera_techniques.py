@@ -113,6 +113,11 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
         ),
         thorough=Checks(cases=("closed_box", "thousand_samples", "hidden_environment")),
     ),
+    "focal_points": Technique(
+        "composed_path", {"scattering": {"type": "focal_points", "always_use": True}},
+        checks=Checks(cases=("no_light", "materials")),
+        thorough=EVERYTHING,
+    ),
     "many_connections": Technique(
         "reweighted_direct", {"light_samples": 4},
         checks=Checks(

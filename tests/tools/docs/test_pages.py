@@ -34,7 +34,7 @@ VALUES = {
     "roulette": "throughput", "save_learned": "learned.npz", "load_learned": "learned.npz",
     **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
     **dict.fromkeys(["connections", "count", "light_samples", "camera_samples", "learn_every"], 3),
-    "candidates": 4, "splits": 7, "share": 0.5,
+    "boxes": 16, "candidates": 4, "splits": 7, "share": 0.5,
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
     "keep_learned": True,
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,

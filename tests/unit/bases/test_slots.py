@@ -40,6 +40,7 @@ def _refusal(**slots: Any) -> str:
     ("next_event", "visibility_roulette", "shadow_test"),
     ("connections", "weighted_numbers", "aperture, time, wavelength"),
     ("shadow_test", "spatial_lights", "next_event"),
+    ("directions", "focal_points", "scattering"),
     ("aperture", "weighted_connections", "connections"),
 ])  # fmt: skip
 def test_an_error_names_the_right_slot_of_a_decision(slot: str, plugin: str, belongs: str) -> None:
