@@ -15,6 +15,7 @@ from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
 from ...scene.regions.nested_regions import NestedRegions
+from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .decisions import FocalScattering
 from .fitting import LineArrays, fitted_boxes, fitted_rows
@@ -196,7 +197,7 @@ def _chosen(lines: Lines, bsdf: mi.Float, value: np.ndarray, most: int) -> LineA
     count = min(most, len(value))
     index = np.searchsorted(running, (np.arange(count) + 0.5) / count)
     index, times = np.unique(np.minimum(index, len(value) - 1), return_counts=True)
-    where = mi.UInt32(index.astype(np.uint32))
+    where = from_numpy(mi.UInt32, index)
     p, d = (dr.gather(type(x), x, where).numpy().T for x in (lines.p, lines.d))
     region = dr.gather(mi.UInt32, lines.region, where).numpy()
     density = dr.gather(mi.Float, bsdf, where).numpy()
