@@ -275,7 +275,7 @@ class Planner(Schedule):
             self._leave_out()
             self.decide(light_paths=choice)
             discards = trial.chosen_variance < verdicts.FAR_LESS
-        return replace(self._stage(), discards_earlier=discards)
+        return replace(self._stage(), discards_earlier=discards or self._discards_pilots)
 
     def _finds_all_light(self, slot: str) -> bool:
         return self._techniques[slot].finds_all_light

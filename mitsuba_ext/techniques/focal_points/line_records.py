@@ -138,18 +138,15 @@ class LineRecords(Observer):
         self._lanes = 0
         slot = dr.arange(mi.UInt32, len(self._pdf))
         value = dr.gather(mi.Float, self._total, slot % self._slots) - self._before
+        value *= dr.sqrt(dr.gather(mi.Float, importance, slot % self._slots))
         found = (value > 0) & dr.isfinite(value) & (self._pdf > 0) & dr.isfinite(self._pdf)
+        dr.eval(value, found)
         slot = dr.compress(found)
         if len(slot):
-            path = slot % self._slots
-            value = dr.gather(mi.Float, self._total, path) - dr.gather(
-                mi.Float, self._before, slot
-            )
-            scale = dr.sqrt(dr.gather(mi.Float, importance, path))
             lines = Lines(
                 dr.gather(mi.Point3f, self._p, slot), dr.gather(mi.Vector3f, self._d, slot),
                 dr.gather(mi.UInt32, self._where, slot), dr.gather(mi.Float, self._pdf, slot),
-                value * scale, path % BATCHES,
+                dr.gather(mi.Float, value, slot), slot % self._slots % BATCHES,
             )  # fmt: skip
             dr.eval(lines)
             self._passes.append(lines)

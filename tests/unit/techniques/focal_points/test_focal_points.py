@@ -9,9 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.planning.planner import LearningPlan, Planner
+from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
 from mitsuba_ext.techniques.focal_points.fitting import LineArrays, fitted_boxes, fitted_rows
 from mitsuba_ext.techniques.focal_points.focal_density import FocalDensity
+from mitsuba_ext.transport.decisions import Decisions
 from tests.support.statistical import load
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -120,6 +123,29 @@ def test_one_line_and_equal_points_give_boxes() -> None:
         lines = lines._replace(p=lines.p * np.float32(spread))
         low, high, probability = fitted_boxes(lines, 4)
         assert (high > low).all() and np.isfinite(probability).all()
+
+
+def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
+    """A learner says so before the third stage."""
+    learner = SimpleNamespace(
+        wants_scout=False, discards_pilots=False, start=lambda *_: None, finish=lambda: None,
+        effect=None, learn=lambda pilot: None,
+    )  # fmt: skip
+    technique = SimpleNamespace(
+        decision=lambda setting: None, learner=lambda *_: learner, doubles=False,
+        bytes_per_sample=0,
+    )  # fmt: skip
+    scene = load("cornell_box", width=4, height=4)
+    setting = Setting(scene, scene.sensors()[0], 0, 6, 5, 16)
+    planner = Planner(
+        {"scattering": technique}, setting, (1, 1, 2, 12), lambda *_: None, Decisions(),
+        LearningPlan((1, 1, 2)),
+    )  # fmt: skip
+    discards = []
+    for said in (False, False, True, False):
+        learner.discards_pilots = said
+        discards.append(planner.next_stage().discards_earlier)
+    assert discards == [False, False, True, False]
 
 
 @pytest.mark.slow
