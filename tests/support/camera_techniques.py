@@ -115,8 +115,11 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
     ),
     "focal_points": Technique(
         "composed_path", {"scattering": {"type": "focal_points", "always_use": True}},
-        checks=Checks(cases=("no_light", "materials")),
-        thorough=EVERYTHING,
+        checks=Checks(cases=["materials"]),
+        thorough=Checks(
+            ["cornell_box", "rooms"], ["llvm_ad_spectral"], _WITH_LIGHTS, [-1],
+            ("no_light", "delta_lights", "medium", "empty", "film_of_one_pixel", "three_samples"),
+        ),
     ),
     "many_connections": Technique(
         "reweighted_direct", {"light_samples": 4},
