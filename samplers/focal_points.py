@@ -25,8 +25,8 @@ class FocalPointsPlugin(DecisionPlugin):
 
      * - boxes
        - |int|
-       - The most boxes that stand for these places, up to 256. Each takes about 1 % of the time of
-         a sample. (Default: 32)
+       - The most boxes that stand for these places, up to 256. Each takes up to 3 % of the time
+         of a sample. (Default: 32)
      * - always_use
        - |bool|
        - Whether directions lead to focal points even if the pilots show that this does not pay.
