@@ -40,6 +40,8 @@ class FocalScattering(Scattering):
         number = dr.select(to_focus, sample_1 / share, (sample_1 - share) / (1 - share))
         number = dr.clip(number, 0, ONE_MINUS_EPSILON)
         value, pdf, bs, weight, _ = super().sample(state, ctx, vertex, wo, number, sample_2)
+        if vertex.lobes is not None:
+            vertex.lobes.sampled = None  # They are for the BSDF's own direction
         d = self.density.sample(row, si.p, number, sample_2, to_focus)
         local = si.to_local(d)
         bsdf_value, bsdf_pdf = eval_bsdf(vertex.bsdf, ctx, si, local, to_focus)

@@ -16,14 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Boxes along the longest edge of the region at first, and how often they are divided.
-_FIRST, _DIVISIONS = 8, 4
+#: Boxes along the longest edge of the region at first, and how often boxes are fitted: between two
+#: fits, they are divided.
+_FIRST, _FITS = 8, 4
 
 #: The region is larger by this part of its longest edge, on all sides: virtual images lie outside.
 #: It contains all vertices except this share at either end of each axis.
 _MARGIN, _OUTSIDE = 0.15, 0.01
 
-#: Steps of expectation maximization after each division, and in each level of regions.
+#: Steps of expectation maximization of each fit, and in each level of regions.
 _STEPS, _REGION_STEPS = 10, 10
 
 #: Boxes of a smaller probability are left out.
@@ -64,7 +65,7 @@ def fitted_boxes(lines: LineArrays, most: int) -> tuple[np.ndarray, np.ndarray, 
     low, high = _first_boxes(lines.p)
     probability = np.full(len(low) + 1, 0.5 / len(low))
     probability[0] = 0.5
-    for division in range(_DIVISIONS):
+    for fit in range(_FITS):
         densities = _densities(low, high, lines)
         probability = _maximized(densities, lines.weight, probability)
         order = 1 + np.argsort(-probability[1:], kind="stable")[:most]
@@ -72,7 +73,7 @@ def fitted_boxes(lines: LineArrays, most: int) -> tuple[np.ndarray, np.ndarray, 
         low, high = low[order - 1], high[order - 1]
         probability = np.concatenate([probability[:1], probability[order]])
         is_heavy = probability[1:] > 1 / most
-        if division == _DIVISIONS - 1 or not is_heavy.any():
+        if fit == _FITS - 1 or not is_heavy.any():
             break
         half = 0.5 * (high - low)[is_heavy, None]
         children = low[is_heavy, None] + _CORNERS * half

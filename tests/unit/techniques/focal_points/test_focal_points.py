@@ -52,7 +52,7 @@ def _vertex(bsdf: dict, count: int) -> SimpleNamespace:
     si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(0.8, 0.4, 0.4))))
     si.n, si.wi = si.sh_frame.n, dr.normalize(mi.Vector3f(0.5, -0.3, 0.8))
     plugin = mi.load_dict(bsdf)
-    return SimpleNamespace(si=si, bsdf=mi.BSDFPtr(plugin), held=plugin, medium=None)
+    return SimpleNamespace(si=si, bsdf=mi.BSDFPtr(plugin), held=plugin, medium=None, lobes=None)
 
 
 @pytest.mark.parametrize("bsdf", [
