@@ -22,7 +22,6 @@ from mitsuba_ext.estimators.light_paths.merging.merging_parameters import Mergin
 from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_both_paths
 from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
-from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.device import SampleBytes, device_of
@@ -56,9 +55,10 @@ class Auto(LightPathIntegrator):
 
      * - pilot_spp
        - |int|
-       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With 0, it learns nothing and renders as
-         :monosp:`path` does, with a light tree. (Default: 32)
+       - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
+         all samples (a quarter in short renders). They count towards the image. With 0, it learns
+         nothing and renders as :monosp:`path` does, with a light tree. If it is given, short
+         renders learn too. (Default: 32)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -88,17 +88,19 @@ class Auto(LightPathIntegrator):
     directions that paid before are learned again, from samples with light paths, unless vertices
     are merged; together with light paths, a guide is expected to keep the square root of its
     efficiency. The trial has 16384 samples, spread over the film, which are not part of the image;
-    in renders of less than a million samples, it has as few as 4096. If light paths reduce the
-    variance to less than 0.4 of its value, the samples before the trial are left out of the image.
+    in renders of less than four million samples it has 8192, and of less than two million 4096. If
+    light paths reduce the variance to less than 0.4 of its value, the samples before the trial are
+    left out of the image.
 
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
     the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
-    several lights by a light tree (:monosp:`next_event=tree` of :class:`composed_path`), unless it
-    saves or keeps what it learns. Learning, and compiling the kernels that it needs, would take
-    longer than rendering all samples. :monosp:`statistics.learned` then says so.
-    The shorter a render is, the more light paths must gain: 1.1 times the efficiency of everything
-    else that was learned, and twice that efficiency in renders of half a million samples. With a
-    :monosp:`timeout`, light paths are tried only if there is time to compile their kernels.
+    several lights by a light tree (:monosp:`next_event=tree` of :class:`composed_path`), unless the
+    scene gives :monosp:`pilot_spp`, or it saves or keeps what it learns. Learning, and compiling
+    the kernels that it needs, would take longer than rendering all samples.
+    :monosp:`statistics.learned` then says so. The shorter a render is, the more light paths must
+    gain: 1.1 times the efficiency of everything else that was learned, and twice that efficiency in
+    renders of half a million samples. With a :monosp:`timeout`, light paths are tried only if there
+    is time to compile their kernels.
 
     The best choice has the smallest product of time and expected squared error in a render of this
     length. For choices without light paths, the squared error includes the square of the light that
@@ -150,6 +152,7 @@ class Auto(LightPathIntegrator):
     """
 
     techniques_by_default = Candidate(0.0)
+    learns_if_long = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -172,13 +175,7 @@ class Auto(LightPathIntegrator):
     def plan_learning(self, request, spp, kernels=math.inf):
         scene, film = request.scene, request.sensor.film()
         pixel_count = math.prod(film_extent(film))
-        least = self._least_samples()
-        is_short = pixel_count * spp < least
-        is_short &= not (self.learned_state.target(request) or self.learned_state.keep)
-        plan = super().plan_learning(request, 0 if is_short else spp, kernels)
-        if is_short and plan.restore is None:
-            remark = f"nothing: there are fewer than {least} samples"
-            plan = replace(plan, remark=remark)
+        plan = super().plan_learning(request, spp, kernels)
         kind = PhotonTrial if may_have_media(scene) else LightPathTrial
         tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
         tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
@@ -207,13 +204,6 @@ class Auto(LightPathIntegrator):
         """The estimator of a stage in a scene with media; ``mapper`` makes the one of photons."""
         choice: PhotonChoice = decisions.light_paths or PhotonChoice()
         return choice.estimator(self.walk(decisions, observer), mapper)
-
-    def parameters(self):
-        learns_from = f"{self._least_samples()} samples"
-        return {**super().parameters(), "learns_from": learns_from}
-
-    def _least_samples(self) -> int:
-        return verdicts.least_samples(device_of(mi.Float).is_gpu)
 
     def merging_radius(self, request, side, *sums):
         return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None

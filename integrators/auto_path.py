@@ -26,9 +26,10 @@ class AutoPath(WalkIntegrator):
 
      * - pilot_spp
        - |int|
-       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With 0, it learns nothing and renders as
-         :monosp:`path` does, with a light tree. (Default: 32)
+       - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
+         all samples (a quarter in short renders). They count towards the image. With 0, it learns
+         nothing and renders as :monosp:`path` does, with a light tree. If it is given, short
+         renders learn too. (Default: 32)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -55,9 +56,12 @@ class AutoPath(WalkIntegrator):
          aovs, checkpoint.
 
     **Use it when** you do not know which technique a scene needs, and render 16 or more samples per
-    pixel. **Not when** an image has fewer samples (too few to learn from: several lights are then
-    chosen by a light tree), or when small lamps
+    pixel. **Not when** an image has fewer samples (too few to learn from), or when small lamps
     shine through glass (camera paths do not find their light).
+
+    Renders of fewer than 262144 samples (33554432 on a GPU) learn nothing, and choose among several
+    lights by a light tree, unless the scene gives :monosp:`pilot_spp`, or what is learned is saved
+    or kept: learning, and compiling its kernels, would take longer than rendering all samples.
 
     It is :monosp:`composed_path` with :monosp:`directions=guided`,
     :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
@@ -90,7 +94,7 @@ class AutoPath(WalkIntegrator):
             'max_depth': 8
     """
 
-    can_clamp = True
+    can_clamp = learns_if_long = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -83,14 +83,15 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
     draw independent random numbers.
 
     **Learned selection.** Surfaces are divided into regions, which are smaller in places with more
-    vertices. Pilot samples (:monosp:`pilot_spp`, 16 by default, at most a quarter of all samples;
-    they count towards the image) measure the contributions of connections between each pair of
-    regions, relative to the brightness of the pixel. A region is chosen in proportion to the root
-    mean square of these contributions. A tenth of the choices remain uniform. The MIS weights
-    account for how often each connection is made, so the image is unbiased. Use learned selection
-    if most connections are blocked, as in corridors and between rooms. A sample takes about a fifth
-    longer; if the first pilot shows a small gain, learning ends. In spectral variants and with
-    moving shapes there is little to choose from, and the selection stays uniform.
+    vertices. Pilot samples (:monosp:`pilot_spp`, 16 by default, at most an eighth of all samples,
+    in short renders a quarter; they count towards the image) measure the contributions of
+    connections between each pair of regions, relative to the brightness of the pixel. A region is
+    chosen in proportion to the root mean square of these contributions. A tenth of the choices
+    remain uniform. The MIS weights account for how often each connection is made, so the image is
+    unbiased. Use learned selection if most connections are blocked, as in corridors and between
+    rooms. A sample takes about a fifth longer; if the first pilot shows a small gain, learning
+    ends. In spectral variants and with moving shapes there is little to choose from, and the
+    selection stays uniform.
 
     **Sensors and films.** Light paths can be connected to a :monosp:`perspective`,
     :monosp:`thinlens` or :monosp:`orthographic` sensor; with other sensors, and with films that

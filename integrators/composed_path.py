@@ -116,11 +116,11 @@ class ComposedPath(WalkIntegrator):
          (:monosp:`swarm`, see :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
-       - Number of pilot samples per pixel, from which decisions learn; at most a quarter of all
-         samples (half, if only :monosp:`swarm` learns). They count towards the image. The parameter
-         is accepted only if a decision learns. With 0, nothing is learned. With a stratified
-         sampler, pilots consist of whole passes, and can be longer. (Default: 64 with
-         :monosp:`swarm`, 32 with guided directions or focal points, 4 if only
+       - Number of pilot samples per pixel, from which decisions learn; at most an eighth of all
+         samples (a quarter in short renders; half, if only :monosp:`swarm` learns). They count
+         towards the image. The parameter is accepted only if a decision learns. With 0, nothing is
+         learned. With a stratified sampler, pilots consist of whole passes, and can be longer.
+         (Default: 64 with :monosp:`swarm`, 32 with guided directions or focal points, 4 if only
          :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|

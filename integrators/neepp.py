@@ -62,10 +62,10 @@ class NEEPlusPlus(WalkIntegrator):
        - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. (Default: 512)
      * - pilot_spp
        - |int|
-       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With 0, it learns nothing: lights are chosen by
-         a light tree, and every shadow ray is traced. With a stratified sampler, pilots
-         consist of whole passes, and can be longer. (Default: 16)
+       - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
+         all samples (a quarter in short renders). They count towards the image. With 0, it learns
+         nothing: lights are chosen by a light tree, and every shadow ray is traced. With a
+         stratified sampler, pilots consist of whole passes, and can be longer. (Default: 16)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With

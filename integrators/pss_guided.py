@@ -51,9 +51,10 @@ class PSSGuided(WalkIntegrator):
          to in any case. (Default: true)
      * - pilot_spp
        - |int|
-       - Number of pilot samples per pixel, from which the integrator learns; at most a quarter of
-         all samples. They count towards the image. With fewer than 3, nothing is guided. With a
-         stratified sampler, pilots consist of whole passes, and can be longer. (Default: 32)
+       - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
+         all samples (a quarter in short renders). They count towards the image. With fewer than 3,
+         nothing is guided. With a stratified sampler, pilots consist of whole passes, and can be
+         longer. (Default: 32)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With

@@ -52,8 +52,8 @@ class TwoStage(WalkIntegrator):
          (Default: 0.9)
      * - pilot_spp
        - |int|
-       - With visibility maps: number of pilot samples per pixel, at most a quarter of all samples.
-         They count towards the image. (Default: 4)
+       - With visibility maps: number of pilot samples per pixel, at most an eighth of all samples
+         (a quarter in short renders). They count towards the image. (Default: 4)
      * - save_learned, load_learned
        - |string|
        - With visibility maps: as in :class:`composed_path`. (Default: none)

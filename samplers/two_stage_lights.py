@@ -51,16 +51,17 @@ class TwoStageLightsPlugin(DecisionPlugin):
     BSDF samples are better.
 
     With :monosp:`visibility`, the integrator takes a pilot of :monosp:`pilot_spp` samples per pixel
-    (by default 4, at most a quarter of all; they count towards the image). For each tile of 8
-    pixels (larger ones if there would be more than 8192 tiles), it counts which shadow rays of
-    first vertices are unoccluded: in 16 x 16 cells of the two random numbers that choose a
-    direction, or in 32 x 16 cells of the map. The prior of a cell is the same cell of the
-    surrounding tiles, whose prior is the mean over these tiles. In primary space, the random
-    numbers of later samples are distributed in proportion to the square root of the visibility.
-    With :monosp:`world`, the rectangles of the partition are weighted by the visibility, and
-    divided where it varies; then use more :monosp:`splits`. Densities stay exact and positive, so
-    the image is unbiased whatever the maps contain. Maps need no correction, and they are not made
-    on demand: a map is an array of counters, and every connection still traces its shadow ray.
+    (by default 4, at most an eighth of all, in short renders a quarter; they count towards the
+    image). For each tile of 8 pixels (larger ones if there would be more than 8192 tiles), it
+    counts which shadow rays of first vertices are unoccluded: in 16 x 16 cells of the two random
+    numbers that choose a direction, or in 32 x 16 cells of the map. The prior of a cell is the same
+    cell of the surrounding tiles, whose prior is the mean over these tiles. In primary space, the
+    random numbers of later samples are distributed in proportion to the square root of the
+    visibility. With :monosp:`world`, the rectangles of the partition are weighted by the
+    visibility, and divided where it varies; then use more :monosp:`splits`. Densities stay exact
+    and positive, so the image is unbiased whatever the maps contain. Maps need no correction, and
+    they are not made on demand: a map is an array of counters, and every connection still traces
+    its shadow ray.
 
     Lights other than the environment are sampled as in :monosp:`path`, and so are all lights of a
     scene without an environment. BSDF samples are combined by MIS; lobes narrower than a texel are

@@ -121,8 +121,11 @@ class RememberingPath(WalkIntegrator):
             self.forget()
         if self._knows(request.scene):
             return LearningPlan()
-        # Many renders use what this one learns: pilots have up to three quarters of its samples
         return super().plan_learning(request, 3 * spp, kernels)
+
+    def most_pilot_samples(self, pixel_count, spp):
+        # Many renders use what this one learns: pilots have up to three quarters of its samples
+        return spp // 4
 
     def pace_stage(self, request, spp):
         # Its pilots are worth their time in later renders

@@ -11,14 +11,14 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..planning import kept_learning
+from ..planning import kept_learning, verdicts
 from ..planning.costs import LEARNING_KERNELS
 from ..planning.learner import Learner
-from ..planning.pilots import pilot_samples, stage_weights
+from ..planning.pilots import most_samples, pilot_samples, stage_weights
 from ..planning.planner import Estimators, LearningPlan, Planner
 from ..planning.technique import ParameterReader, Setting, Technique, decisions_of
 from ..rendering.camera import film_extent
-from ..rendering.device import SampleBytes
+from ..rendering.device import SampleBytes, device_of
 from ..rendering.request import Request
 from ..rendering.stages import ReportedSchedule, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
@@ -37,7 +37,7 @@ from .output_variables import OutputVariables
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 
-#: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
+#: Pilots are a quarter of all samples at most: with fewer samples per pixel, there is none.
 _LEAST_SPP = 4
 
 
@@ -85,11 +85,13 @@ class WalkIntegrator(StagedIntegrator):
             ends a sentence in an error message.
         learned_state (LearnedState): Where it keeps what it learns.
         slots (dict[str, Technique]): What fills the slots of the walk.
+        learns_if_long (bool): Whether short renders learn nothing, unless the scene gives
+            ``pilot_spp``, or what is learned is saved or kept.
         learners (dict[str, Learner]): The learners of the last render, by slot.
         outputs (OutputVariables): The channels of the parameter ``aovs``.
     """
 
-    has_light_paths = light_paths_see_media = can_clamp = False
+    has_light_paths = light_paths_see_media = can_clamp = learns_if_long = False
     sees_media = True
     no_expressions = ""
 
@@ -105,6 +107,7 @@ class WalkIntegrator(StagedIntegrator):
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
+        self._asks_for_pilots = False
         self.learned_state = LearnedState(self.name)
 
     # ---- What a subclass calls ----
@@ -136,11 +139,14 @@ class WalkIntegrator(StagedIntegrator):
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             read = self.reader(props)
+            self._asks_for_pilots = read.is_given("pilot_spp")
             self._pilot_spp = read("pilot_spp", max(wishes), minimum=0)
             self.learned_state = LearnedState.read(self.name, read)
 
     def parameters(self) -> dict[str, Any]:
         pilots = {} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp}
+        if self._least_samples:
+            pilots["learns_from"] = f"{self._least_samples} samples"
         return {
             **super().parameters(), **self._described_slots(), **pilots,
             **self.learned_state.parameters(),
@@ -164,7 +170,12 @@ class WalkIntegrator(StagedIntegrator):
         if self.max_depth < 2:
             return LearningPlan()
         pixel_count = math.prod(film_extent(sensor.film()))
-        pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
+        is_kept = self.learned_state.target(request) or self.learned_state.keep
+        least = 0 if is_kept else self._least_samples
+        if pixel_count * spp < least:
+            return LearningPlan(remark=f"nothing: there are fewer than {least} samples")
+        most = self.most_pilot_samples(pixel_count, spp)
+        pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0, most)
         if self.learned_state.keep:
             kept = kept_learning.find(scene, self._learned_by(sensor))
             if kept is not None and sum(pilots) <= kept.pilot_spp:
@@ -174,6 +185,17 @@ class WalkIntegrator(StagedIntegrator):
         is_short = self._pilot_spp and spp < _LEAST_SPP
         remark = f"nothing: {spp} spp are too few" if is_short else ""
         return LearningPlan(tuple(pilots), remark)
+
+    def most_pilot_samples(self, pixel_count: int, spp: int) -> int:
+        """The most pilot samples per pixel of a render with ``spp`` of them."""
+        return most_samples(pixel_count, spp)
+
+    @property
+    def _least_samples(self) -> int:
+        """The number of samples of a render from which on it learns."""
+        if not self.learns_if_long or self._asks_for_pilots or not self._pilot_spp:
+            return 0
+        return verdicts.least_samples(device_of(mi.Float).is_gpu)
 
     def pace_stage(self, request: Request, spp: int) -> Stage | None:
         if self.has_light_paths or "caustics" in self.slots:

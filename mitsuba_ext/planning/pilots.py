@@ -13,6 +13,12 @@ from .technique import Technique
 #: this number of samples per pixel on, as they then cost little; below, a quarter.
 _MANY_SAMPLES = 8
 
+#: Elsewhere, pilots have at most an eighth of all samples, and a sixteenth beyond this number of
+#: paths: where a path takes little time, recording it and building trees takes as long again. In
+#: short renders they may have a quarter, up to ``_FEW_SAMPLES`` of each pixel, from which three
+#: pilots can be made. (docs/results/auto_path.md)
+_ENOUGH_PATHS, _FEW_SAMPLES = 1 << 18, 4
+
 #: Approximate number of paths of each of the first two pilots, which measure the benefit of
 #: learning.
 _TRIAL_PATHS = 1 << 17
@@ -36,13 +42,13 @@ def pilot_samples(
     pixel_count: int,
     spp: int,
     pilot_spp: int,
+    most: int,
 ) -> list[int]:
     """The samples per pixel of each pilot.
 
-    Pilots have at most a quarter of all samples, as more of them gain little; half where each pilot
-    doubles the samples (``Technique.doubles``). The first two pilots are short trials: if
-    learning does not pay off, little time has been spent. The later pilots already use what was
-    learned from all before them.
+    Pilots have at most half of all samples where each pilot doubles the samples
+    (``Technique.doubles``). The first two pilots are short trials: if learning does not pay off,
+    little time has been spent. The later pilots already use what was learned from all before them.
 
     Parameters:
         slots: The techniques that fill the slots of the walk.
@@ -50,8 +56,9 @@ def pilot_samples(
         pixel_count: Sampled pixels of the film.
         spp: Samples per pixel of the render.
         pilot_spp: Samples per pixel of all pilots, as the scene asks for them.
+        most: The most of them, where they do not double (:func:`most_samples`).
     """
-    samples = min(pilot_spp, spp // 4)
+    samples = min(pilot_spp, most)
     learning = [t for t in slots.values() if t.pilot_spp and t.can_learn(scene, samples)]
     if not learning:
         return []
@@ -69,6 +76,13 @@ def pilot_samples(
         return [quarter, quarter, samples - 2 * quarter]
     rest = samples - 2 * trial
     return [trial, trial, quarter, rest - quarter]
+
+
+def most_samples(pixel_count: int, spp: int) -> int:
+    """The most samples per pixel of all pilots, where they do not double, in a render with ``spp``
+    samples of each pixel."""
+    enough = max(spp // 16, -(-_ENOUGH_PATHS // pixel_count))
+    return max(min(spp // 8, enough), min(spp // 4, _FEW_SAMPLES))
 
 
 def doubling_pilots(samples: int) -> list[int]:

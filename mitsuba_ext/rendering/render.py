@@ -200,7 +200,7 @@ class Job:
         discards = stage.discards_earlier
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         if stage.images is not None and not self.plan.structured:
-            length = min(length, -(-samples // FEWEST_PASSES))
+            length = min(length, max(1, samples // FEWEST_PASSES))
             length = whole_warps(length, self.plan.warp)
         while done < (wanted := self.plan.whole(before, known.samples, samples)):
             if self._stopped(interrupt):

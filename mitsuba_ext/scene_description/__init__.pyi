@@ -79,7 +79,7 @@ def auto(
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most a quarter of all samples. (Default: 32)
+            most an eighth of all samples (a quarter in short renders). (Default: 32)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -124,7 +124,7 @@ def auto_path(
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most a quarter of all samples. (Default: 32)
+            most an eighth of all samples (a quarter in short renders). (Default: 32)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -277,9 +277,10 @@ def composed_path(
             the aperture, the time, and the wavelengths of a camera ray. (Default: sampler)
         distance (string): Which random numbers choose the distance that a camera ray travels in a
             homogeneous medium. (Default: sampler)
-        pilot_spp (int): Number of pilot samples per pixel, from which decisions learn; at most a
-            quarter of all samples (half, if only swarm learns). (Default: 64 with swarm, 32 with
-            guided directions or focal points, 4 if only triple_product learns, otherwise 16)
+        pilot_spp (int): Number of pilot samples per pixel, from which decisions learn; at most an
+            eighth of all samples (a quarter in short renders; half, if only swarm learns).
+            (Default: 64 with swarm, 32 with guided directions, 4 if only triple_product learns,
+            otherwise 16)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -739,7 +740,7 @@ def neepp(
         max_memory (float): Memory for what is learned, and for the table of spatial, in MiB.
             (Default: 512)
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most a quarter of all samples. (Default: 16)
+            most an eighth of all samples (a quarter in short renders). (Default: 16)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -860,7 +861,7 @@ def pss_guided(
         nee_first_bounce (bool): Whether to connect the first vertex of a path to lights. (Default:
             true)
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most a quarter of all samples. (Default: 32)
+            most an eighth of all samples (a quarter in short renders). (Default: 32)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -1253,8 +1254,8 @@ def two_stage(
             (primary) or over directions (world). (Default: unknown)
         reallocated (float): With visibility maps: the share of the connections that the maps
             sample, 0 to 0.99. (Default: 0.9)
-        pilot_spp (int): With visibility maps: number of pilot samples per pixel, at most a quarter
-            of all samples. (Default: 4)
+        pilot_spp (int): With visibility maps: number of pilot samples per pixel, at most an eighth
+            of all samples (a quarter in short renders). (Default: 4)
         save_learned, load_learned (string): With visibility maps: as in composed_path. (Default:
             none)
         keep_learned (bool): With visibility maps: as in composed_path. (Default: false)
@@ -1298,6 +1299,7 @@ def vcm(
     *,
     merging: str = "caustics",
     radius: float = 0,
+    radius_in_media: float = 0,
     radius_decay: float = 0.75,
     connections: int = 1,
     light_image: bool = True,
@@ -1325,12 +1327,15 @@ def vcm(
 
     Parameters:
         merging (string): Where vertices are merged: with caustics, only where light arrives from a
-            mirror or smooth glass; with all, on all rough surfaces, as in the source; with none,
-            nowhere, which makes the integrator bdpt. (Default: caustics)
+            mirror or smooth glass; with all, on all rough surfaces and in all media, as in the
+            sources; with none, nowhere, which makes the integrator bdpt. (Default: caustics)
         radius (float): Radius within which vertices are merged in a first pass of one sample per
             pixel, in units of the scene. (Default: 0)
-        radius_decay (float): α, in (0, 1]: the squared radius of pass i is the squared radius of
-            the first pass times i to the power of α − 1. (Default: 0.75)
+        radius_in_media (float): As radius, for vertices in participating media, which are merged in
+            a ball: a pass of k samples per pixel uses 1/k of the volume. (Default: 0)
+        radius_decay (float): α, in (0, 1]: the squared radius of pass i (in media, its cube) is the
+            squared radius (or cube) of the first pass times i to the power of α − 1. (Default:
+            0.75)
         connections (int): How many vertices of light paths, chosen at random, each vertex of a
             camera path is connected to; 0 for none. (Default: 1)
         light_image (bool): Whether to connect light paths to the sensor as well (t = 1). (Default:

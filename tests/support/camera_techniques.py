@@ -84,7 +84,7 @@ CAMERA_TECHNIQUES: dict[str, Technique] = {
         ),
     ),
     "auto_path": Technique(
-        "auto_path", is_plugin=True,
+        "auto_path", {"pilot_spp": 32}, is_plugin=True,
         checks=Checks(
             ["rooms"], furnaces=["furnace_glass"], depths=[-1],
             cases=(

@@ -44,8 +44,13 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
 
 
 def test_a_render_that_is_too_short_to_learn_says_so() -> None:
-    assert learned(stage(), 4) == "nothing: there are fewer than 262144 samples"
-    assert "learns_from = 262144 samples" in str(auto())
+    short = "nothing: there are fewer than 262144 samples"
+    for name in ("auto", "auto_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 2})
+        assert learned(stage(), 32, integrator) == short
+        assert "learns_from = 262144 samples" in str(integrator)
+    asked = mi.load_dict({"type": "auto_path", "max_depth": 2, "pilot_spp": 8})
+    assert learned(stage(), 32, asked) != short and "learns_from" not in str(asked)
 
 
 def test_a_render_that_is_too_short_to_learn_has_a_light_tree() -> None:
@@ -93,7 +98,8 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
         trials.append(trial)
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
-    monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    for share in ("_MOST", "_SHARE"):
+        monkeypatch.setattr(light_paths, share, 1.0)
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
@@ -213,7 +219,7 @@ def test_auto_path_uses_maps_of_times_where_they_pay() -> None:
     scene = load("six_balls", width=96, height=54)
     plain = mi.load_dict({"type": "composed_path", "max_depth": 2})
     noise = batches(scene, plain, 64, [1, 2]).var(axis=0).mean()
-    integrator = mi.load_dict({"type": "auto_path", "max_depth": 2})
+    integrator = mi.load_dict({"type": "auto_path", "max_depth": 2, "pilot_spp": 32})
     ours = batches(scene, integrator, 64, [1, 2]).var(axis=0).mean()
     assert "times" in integrator.statistics.learned
     assert ours < 0.4 * noise  # a tenth
@@ -226,6 +232,8 @@ def test_where_no_ray_has_a_time_or_a_lens_point_auto_path_renders_the_same_imag
     words = {"directions": "guided", "next_event": "contribution"}
     images = [
         batches(scene, mi.load_dict({**plugin, "max_depth": 4}), 32, [3])[0]
-        for plugin in ({"type": "auto_path"}, {"type": "composed_path", **words})
+        for plugin in (
+            {"type": "auto_path", "pilot_spp": 32}, {"type": "composed_path", **words}
+        )  # fmt: skip
     ]
     assert_same_image(*images)

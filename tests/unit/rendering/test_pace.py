@@ -34,6 +34,11 @@ def _integrator(name: str, **parameters: Any) -> mi.Integrator:
     return mi.load_dict({"type": name, "max_depth": 4, **parameters})
 
 
+@pytest.fixture(autouse=True)
+def short_renders_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
+
+
 class _Clock:
     """A clock that only passes advance: each sample per pixel takes a tenth of a second."""
 
@@ -206,8 +211,7 @@ def test_learning_begins_only_where_there_is_time_to_compile():
 
 
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
-def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
-    monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
+def test_passes_of_other_lengths_compile_no_kernels(name):
     scene, compiled = _scene(), []
     for spp in (32, 64, 48, 80):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -94,7 +94,8 @@ CASES = {
         "type": "point", "position": [-1, 2, 1], "intensity": 3.0}), {"type": "neepp"}),
     "distances": (lambda: fog("area", homogeneous(STRONG)), {
         "type": "swarm_path", "always_use": True}),
-    "auto_path": (lambda: fog("area", homogeneous(STRONG)), {"type": "auto_path"}),
+    "auto_path": (lambda: fog("area", homogeneous(STRONG)), {
+        "type": "auto_path", "pilot_spp": 32}),
 }  # fmt: skip
 
 

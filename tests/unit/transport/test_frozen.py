@@ -21,8 +21,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 INTEGRATORS = ["composed_path", "auto_path", "bdpt", "mlt", "pssmlt", "erpt"]
 
-#: So few that each makes several mutations.
-_CHAINS = {"mlt": {"chains": 256}, "pssmlt": {"chains": 256}}
+#: So few chains that each makes several mutations; pilots, which short renders do not have.
+_CHAINS = {"mlt": {"chains": 256}, "pssmlt": {"chains": 256}, "auto_path": {"pilot_spp": 8}}
 
 
 @pytest.fixture(autouse=True)

@@ -298,7 +298,7 @@ SEEING = {
                   "slope": 2.0, "floor": 0.3},
     "guided": {"type": "pss_guided", "always_guide": True},
     "tiles": {"type": "pss_guided", "always_guide": True, "regions": "tiles", "tile": 4},
-    "auto_path": {"type": "auto_path"},
+    "auto_path": {"type": "auto_path", "pilot_spp": 32},
     "many": {"type": "reweighted_direct", "light_samples": 3},
     "everywhere": {"type": "composed_path",
                    "connections": {"type": "weighted_connections", "vertices": "all", "count": 3}},
