@@ -279,8 +279,8 @@ def composed_path(
             homogeneous medium. (Default: sampler)
         pilot_spp (int): Number of pilot samples per pixel, from which decisions learn; at most an
             eighth of all samples (a quarter in short renders; half, if only swarm learns).
-            (Default: 64 with swarm, 32 with guided directions, 4 if only triple_product learns,
-            otherwise 16)
+            (Default: 64 with swarm, 32 with guided directions or focal points, 4 if only
+            triple_product learns, otherwise 16)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
