@@ -72,12 +72,21 @@ class ChosenVertices(Subpaths):
         total = h.total + importance
         active = active & (importance > 0)
         taken = active & (hashed_2d(seed, mi.UInt32(_CHOICE)).x * total <= importance)
-        words = [*vertex.path.β, importance, as_float(seed), as_float(vertex.depth)]
-        words += to_words(vertex.si, self._is_whole)
-        words += [as_float(state) for state in vertex.path.events or ()]
-        dr.scatter(self._words, mi.ArrayXf(words), h.lane, taken)
+        self._store(vertex, importance, seed, taken)
         dr.scatter(self._totals, total, h.lane, active)
         return mi.Spectrum(0), mi.UInt32(0)
+
+    @dr.syntax
+    def _store(
+        self, vertex: Vertex, importance: mi.Float, seed: mi.UInt32, taken: mi.Bool
+    ) -> None:
+        """Stores a vertex."""
+        # A branch: the deeper a vertex lies, the more rarely it is taken
+        if dr.hint(taken, label="chosen vertices"):
+            words = [*vertex.path.β, importance, as_float(seed), as_float(vertex.depth)]
+            words += to_words(vertex.si, self._is_whole)
+            words += [as_float(state) for state in vertex.path.events or ()]
+            dr.scatter(self._words, mi.ArrayXf(words), vertex.path.history.lane, taken)
 
     def importance(self, vertex: Vertex) -> mi.Float:
         """The importance of a vertex; 0 where it has no connections through casters."""

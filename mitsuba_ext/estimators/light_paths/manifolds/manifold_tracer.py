@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
 from ....transport.frozen import frozen
-from ....transport.numbers import Numbers, copied, go_to, reached
+from ....transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ....transport.path_program import PathProgram
 from ....transport.walk import Walk
 from .chosen_vertices import ChosenVertices
@@ -84,11 +84,15 @@ class ManifoldProgram(PathProgram):
             h.total + self.subpaths.importance(vertex),
         )
 
+    @dr.syntax
     def emission(self, weights, scene, si, ds, path, pdf):
         length = path.history.length
         own = (length > 0) & (length != _NEVER) & (ds.emitter != None)  # noqa: E711
-        mis = self._connections.weight(path, si, ds, own)
-        return dr.select(own, mis, weights.emission(path.arrival.pdf, pdf))
+        mis = weights.emission(path.arrival.pdf, pdf)
+        # A branch: few paths take it
+        if dr.hint(own, label="weight of chains"):
+            mis = self._connections.weight(path, si, ds, own)
+        return mis
 
 
 @dataclass
@@ -109,7 +113,8 @@ class ManifoldTracer:
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
     ) -> Sample:
-        # Evaluated now, since several kernels read the rays
+        # Evaluated now, since several kernels read the rays; the walk needs no differentials
+        rays = replace(rays, ray=mi.RayDifferential3f(mi.Ray3f(rays.ray)))
         dr.eval(rays)
         trace = _traced if self.walk.observer.can_be_frozen else _traced.__wrapped__
         # Chains are recorded on the host, which a frozen function cannot do
@@ -131,6 +136,8 @@ class ManifoldTracer:
         walk = replace(self.walk, program=program)
         sample, direct = walk.unclamped(scene, sampler, rays, active)
         vertices.schedule()
+        # With the state of the sampler: a later kernel would trace the walk again to find it
+        schedule_state(sampler)
         dr.eval(sample, direct)
         L, parts, tested, chains = self.connections.gather(vertices, rays, channels, records)
         sample = replace(sample, L=sample.L + L, shadow_count=sample.shadow_count + tested)

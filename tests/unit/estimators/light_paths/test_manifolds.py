@@ -435,6 +435,16 @@ def test_passes_are_recorded(monkeypatch) -> None:
     assert len(traced) == 2
 
 
+def test_a_pass_traces_its_walk_once() -> None:
+    """The state of the sampler is found by the same kernel as the samples."""
+    scene = _scene(**_statistical()["ball"])
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history()
+        _render(scene, 4, pilot_spp=0)
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+    assert sum("loop: walk" in kernel["ir"].getvalue() for kernel in kernels) == 1
+
+
 def test_the_same_seed_gives_the_same_image() -> None:
     gc.collect()  # as above
     scene = _scene(**_statistical()["ball"])
