@@ -95,7 +95,7 @@ REGRESSIONS = {
         Regression("swarm_path", "discharge_lamps", {"always_use": True}, max_depth=4, spp=2048,
                    variant="llvm_ad_spectral", is_slow=True),
         Regression("composed_path", "near_lights", max_depth=4, is_slow=True),
-        Regression("composed_path", "caustic", {"caustics": "manifold"}, spp=512, is_slow=True),
+        Regression("composed_path", "pool", {"caustics": "manifold"}, max_depth=8, is_slow=True),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
         Regression("reweighted_wavelength", "prism", {"nested": "composed_path"},
                    variant="llvm_ad_spectral"),
