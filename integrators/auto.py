@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import mitsuba as mi
@@ -16,22 +15,19 @@ from mitsuba_ext.estimators.light_paths.choice.light_paths import (
     AutoLightPaths,
     LightPathTrial,
 )
-from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonChoice, PhotonTrial
 from mitsuba_ext.estimators.light_paths.emission import LightEmission
+from mitsuba_ext.estimators.light_paths.light_media import outside_of
 from mitsuba_ext.estimators.light_paths.merging.merging_parameters import MergingParameters
 from mitsuba_ext.estimators.light_paths.path_memory import bytes_of_both_paths
-from mitsuba_ext.estimators.light_paths.photons.photon_mapper import PhotonMapper
 from mitsuba_ext.estimators.light_paths.photons.photons import photon_mapper
 from mitsuba_ext.planning.costs import LEARNING_KERNELS, TRIAL_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.device import SampleBytes, device_of
+from mitsuba_ext.rendering.request import Request
 from mitsuba_ext.scene.bsdfs import has_clear_curves
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
-from mitsuba_ext.transport.decisions import Decisions
-from mitsuba_ext.transport.estimator import Estimator
-from mitsuba_ext.transport.observer import Observer
 
 #: Light paths are not tried in films with more pixels than fit into this number of times the memory
 #: of a pass, on a CPU: a third of its memory. (A pass has at least one sample of each pixel.)
@@ -176,37 +172,28 @@ class Auto(LightPathIntegrator):
         scene, film = request.scene, request.sensor.film()
         pixel_count = math.prod(film_extent(film))
         plan = super().plan_learning(request, spp, kernels)
-        kind = PhotonTrial if may_have_media(scene) else LightPathTrial
-        tries = bool(plan.pilots) and kind.is_possible(pixel_count, spp)
+        tries = bool(plan.pilots) and LightPathTrial.is_possible(pixel_count, spp)
         tries &= kernels >= LEARNING_KERNELS + TRIAL_KERNELS
         fits = pixel_count <= self._most_pixels
-        if not (tries or plan.restore) or not fits or not self._can_try(scene):
+        if not (tries or plan.restore) or not fits or not self._can_try(request):
             return plan
-        trial = functools.partial(kind.in_own_stage, film)
+        has_photons = _has_photons(scene)
+        trial = functools.partial(LightPathTrial.in_own_stage, film, has_photons)
         return replace(plan, tries=tries, trial=trial)
 
     def estimators(self, request, spp, learning):
         if learning.trial is None:
             return self.walk
-        if may_have_media(request.scene):
-            mapper = functools.cache(
-                functools.partial(photon_mapper, self, request, self.merging)
-            )
-            return functools.partial(self._in_media, mapper)
-        return super().estimators(request, spp, learning)
-
-    def _in_media(
-        self,
-        mapper: Callable[[], PhotonMapper],
-        decisions: Decisions,
-        observer: Observer | None = None,
-    ) -> Estimator:
-        """The estimator of a stage in a scene with media; ``mapper`` makes the one of photons."""
-        choice: PhotonChoice = decisions.light_paths or PhotonChoice()
-        return choice.estimator(self.walk(decisions, observer), mapper)
+        estimators = super().estimators(request, spp, learning)
+        if not _has_photons(request.scene):
+            return estimators
+        photons = functools.partial(photon_mapper, self, request, self.merging)
+        return replace(estimators, photons=functools.cache(photons))
 
     def merging_radius(self, request, side, *sums):
-        return super().merging_radius(request, side, *sums) if _can_merge(request.scene) else None
+        if not _can_merge(request.scene) or may_have_media(request.scene):
+            return None
+        return super().merging_radius(request, side, *sums)
 
     @property
     def _most_pixels(self) -> int:
@@ -215,21 +202,14 @@ class Auto(LightPathIntegrator):
         fits = device.lanes(bytes_of_both_paths(1.0, self.max_depth))
         return fits if device.is_gpu else _EXCESS * fits
 
-    def _can_try(self, scene: mi.Scene) -> bool:
-        """Whether light paths can be tried in the scene."""
-        if self.max_depth < 2:
-            return False
-        has_media = may_have_media(scene)
-        # In media there is only merging
-        if has_media and not _can_merge(scene):
-            return False
-        if not AutoLightPaths().can_learn(scene, 1):
-            return False
-        # Nor may light pass through curves: merging would have to find it
-        if has_media and has_clear_curves(scene):
+    def _can_try(self, request: Request) -> bool:
+        """Whether light paths can be tried."""
+        scene = request.scene
+        if self.max_depth < 2 or not AutoLightPaths().can_learn(scene, 1):
             return False
         try:
             LightEmission(scene)
+            outside_of(self.name, self.query(scene), scene, request.sensor)
         except NotImplementedError:
             return False
         return True
@@ -239,3 +219,9 @@ def _can_merge(scene: mi.Scene) -> bool:
     """Only paths of equal wavelengths and times merge: all pixels would have to share these, even
     if nothing is merged in the end."""
     return not (mi.is_spectral or movers(scene))
+
+
+def _has_photons(scene: mi.Scene) -> bool:
+    """Whether photons are a candidate: in scenes with media, where vertices are not merged beside
+    other techniques. No light may pass through curves, because photons would have to find it."""
+    return may_have_media(scene) and _can_merge(scene) and not has_clear_curves(scene)

@@ -17,6 +17,7 @@ import mitsuba as mi
 from ..estimators.light_paths.bidirectional_programs import LightSums
 from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
+from ..estimators.light_paths.choice.photon_samples import PHOTONS
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_media import outside_of
 from ..estimators.light_paths.light_side import LightSide
@@ -28,6 +29,7 @@ from ..estimators.light_paths.merging.merging_radius import MergingRadii
 from ..estimators.light_paths.partial_sums import PartialSums
 from ..estimators.light_paths.path_memory import bytes_of_both_paths
 from ..estimators.light_paths.path_tracer import BidirectionalPathTracer
+from ..estimators.light_paths.photons.photon_mapper import PhotonMapper
 from ..estimators.light_paths.scattering import SurfaceTerms
 from ..images import image_files
 from ..rendering.camera import film_extent
@@ -183,6 +185,8 @@ class LightPathEstimators:
         radii: Within what radii vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
         images: Receives the contributions of all techniques; ``None`` if nothing does.
         outside: See :class:`LightWalk`.
+        photons: Makes the estimator with photons, where vertices are merged by no other one;
+            ``None`` where they are.
     """
 
     integrator: LightPathIntegrator
@@ -190,12 +194,15 @@ class LightPathEstimators:
     radii: Callable[..., MergingRadii | None]
     images: TechniqueImages | None = None
     outside: mi.MediumPtr | None = None
+    photons: Callable[[], PhotonMapper] | None = None
 
     def __call__(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
         integrator, side = self.integrator, self.side
         always = LightPathChoice(integrator.techniques_by_default, self.images)
         choice: LightPathChoice = decisions.light_paths or always
         techniques = choice.techniques
+        if self.photons is not None and techniques == PHOTONS:
+            return self.photons()
         are_traced = techniques.light_paths > 0
         next_event = decisions.next_event
         if not integrator.sample_direct:
@@ -214,12 +221,15 @@ class LightPathEstimators:
         if radii is not None and choice.pixel_width > 1:
             radii = radii.of_coarse_film(choice.pixel_width)
         sample_bytes = bytes_of_both_paths(techniques.light_paths, integrator.max_depth)
-        return BidirectionalPathTracer(
+        tracer = BidirectionalPathTracer(
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radii=radii,
             merges_all=integrator.merges_all, light_paths=techniques.light_paths,
             most_lanes=device_of(mi.Float).lanes(sample_bytes), outside=self.outside,
         )  # fmt: skip
+        if choice.photons is None:
+            return tracer
+        return choice.photons.beside(tracer, self.photons(), side.sensor is not None)
 
 
 @variant_bound

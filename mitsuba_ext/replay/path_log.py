@@ -172,7 +172,7 @@ class PathLog(Observer):
         is_light = active & _is_light(value)
         self._add(next(self._merges), self._depth, is_light, rgb=self._rgb(value), weight=mis)
 
-    def photon(self, value, carried, history, active) -> None:
+    def photon(self, value, carried, history, path, active) -> None:
         # The vertex may not be known yet: photons of media come before it
         is_light = active & _is_light(value)
         self._add(

@@ -33,6 +33,7 @@ from ....scene.movers import movers
 from ....util.stored_arrays import StoredArrays
 from .candidates import MOST_TRIED, Candidate
 from .path_moments import Counts, Estimate, PathMoments
+from .photon_samples import PHOTONS, PhotonSamples
 from .predicted_errors import PredictedErrors
 from .technique_observer import TechniqueObserver
 
@@ -61,11 +62,13 @@ class LightPathChoice:
         observer: Observes their contributions.
         pixel_width: The paths belong to a film with fewer pixels; this is the width of such a pixel
             in pixels of the real film.
+        photons: Receives samples of photons beside these techniques; ``None`` for no such samples.
     """
 
     techniques: Candidate = Candidate(1.0, merges=True)
     observer: TechniqueObserver | None = None
     pixel_width: float = 1.0
+    photons: PhotonSamples | None = None
 
 
 class LightPathCount(Technique):
@@ -138,6 +141,8 @@ class LightPathTrial(Trial):
         spp: Samples per pixel of the render.
         is_sparse: Whether one stage of :attr:`samples` is enough, whose image is not kept. If not,
             there are pilots of all pixels.
+        has_photons: Whether photons (:class:`PhotonSamples`) are a candidate. They are tried only
+            if the render is long enough.
 
     Attributes:
         samples: The pixel of each sample of the trial.
@@ -148,7 +153,9 @@ class LightPathTrial(Trial):
         check: Checks what was chosen; ``None`` if that is ``path``.
     """
 
-    def __init__(self, film: mi.Film, spp: int, is_sparse: bool = False) -> None:
+    def __init__(
+        self, film: mi.Film, spp: int, is_sparse: bool = False, has_photons: bool = False
+    ) -> None:
         extent = film_extent(film)
         if is_sparse:
             coarse = CoarseFilm.of(*extent, _trial_samples(extent[0] * extent[1] * spp))
@@ -157,9 +164,12 @@ class LightPathTrial(Trial):
         self._film, self._coarse = film, coarse
         corner, self._width = first_pixel(film), coarse.width
         self._moments: PathMoments | None = PathMoments(coarse, corner, extent[0], spp)
+        self._has_photons = has_photons
+        is_tried = has_photons and PhotonSamples.is_possible(coarse.pixel_count * spp)
         self._choice = LightPathChoice(
-            observer=self._moments, pixel_width=coarse.pixel_width
-        )
+            observer=self._moments, pixel_width=coarse.pixel_width,
+            photons=PhotonSamples(coarse, spp) if is_tried else None,
+        )  # fmt: skip
         self.samples, self._spp, self._pixel_count = coarse.samples, spp, coarse.pixel_count
         self.rival = Rival()
         self.estimate: Estimate | None = None
@@ -188,10 +198,18 @@ class LightPathTrial(Trial):
         # Beside merging, it was not tried
         return not self._choice.techniques.merges
 
+    @property
+    def _chooses_photons(self) -> bool:
+        return self._has_photons and self._choice.techniques == PHOTONS
+
+    def leaves_out(self, slot: str, finds_all_light: bool) -> bool:
+        # Photons bring all light: nothing is connected to lights
+        return finds_all_light or (self._chooses_photons and slot == "next_event")
+
     @classmethod
-    def in_own_stage(cls, film: mi.Film, spp: int) -> LightPathTrial:
+    def in_own_stage(cls, film: mi.Film, has_photons: bool, spp: int) -> LightPathTrial:
         """A sparse trial."""
-        return cls(film, spp, is_sparse=True)
+        return cls(film, spp, True, has_photons)
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
@@ -210,17 +228,21 @@ class LightPathTrial(Trial):
 
     def choose(self, rival: Rival) -> LightPathChoice | None:
         moments, self._moments, self.rival = self._moments, None, rival
-        self.candidates, self.estimate = moments.candidates, moments.estimate()
+        self.candidates, self.estimate = list(moments.candidates), moments.estimate()
+        photons = self._choice.photons and self._choice.photons.estimate()
         self.predicted = predicted = PredictedErrors.of(
-            self.estimate, self._width, self._spp, self._pixel_count
+            self.estimate, self._width, self._spp, self._pixel_count, photons
         )
-        times = np.array([cost(c, moments.counts) for c in moments.candidates])
-        self.costs = times / times[0]
-        guided = [self._of_guides(candidate) for candidate in moments.candidates]
+        times = [cost(candidate, moments.counts) for candidate in self.candidates]
+        if photons is not None:
+            self.candidates.append(PHOTONS)
+            times.append(cost(PHOTONS, photons.counts))
+        self.costs = np.divide(times, times[0])
+        guided = [self._of_guides(candidate) for candidate in self.candidates]
         self._best, self._best_with_light_paths = verdicts.best(
             1 / (predicted.variances * self.costs), predicted.uncertainty, rival.efficiency, guided
         )
-        self._choice = LightPathChoice(moments.candidates[self._best])
+        self._choice = LightPathChoice(self.candidates[self._best])
         if self._best == 0:
             return None
         self.check = PredictionCheck(self._film, self._coarse, predicted.of_path)
@@ -280,7 +302,9 @@ class LightPathTrial(Trial):
     def __str__(self) -> str:
         techniques = self._choice.techniques
         pays = techniques.light_paths > 0
-        kept = f"light paths pay: {techniques}" if pays else "light paths do not pay"
+        kept = "light paths do not pay"
+        if pays:
+            kept = f"light paths pay: {'photons' if self._chooses_photons else techniques}"
         if self.estimate is None:
             return kept
         # In units of ``path``

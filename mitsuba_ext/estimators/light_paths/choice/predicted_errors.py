@@ -9,6 +9,7 @@ import numpy as np
 from ....planning.evidence import gain_of, trimmed_batches
 from ....planning.pixel_estimates import relative_scale
 from .path_moments import Estimate
+from .photon_samples import PhotonEstimate
 
 #: Light is missing if this number of its contributions, or fewer, is expected in all pixels of a
 #: render: one render in a thousand holds one.
@@ -52,23 +53,38 @@ class PredictedErrors:
     of_image: tuple[float, float]
 
     @classmethod
-    def of(cls, estimate: Estimate, width: int, spp: int, pixel_count: int) -> PredictedErrors:
+    def of(
+        cls,
+        estimate: Estimate,
+        width: int,
+        spp: int,
+        pixel_count: int,
+        photons: PhotonEstimate | None = None,
+    ) -> PredictedErrors:
         """The predicted errors of a render.
 
         Parameters:
             estimate: What the pilot has found.
             width: Pixels of a row of the pilot's film.
             spp, pixel_count: Samples per pixel of the render, and its number of pixels.
+            photons: What photons have found, which are then the last candidate.
         """
         # Wider neighbourhoods would judge the pixels of a lamp by the wall behind it
-        scale = relative_scale(estimate.mean.reshape(-1, width), 1).ravel()
+        mean = estimate.mean if photons is None else photons.mean
+        scale = relative_scale(mean.reshape(-1, width), 1).ravel()
         shares = _LEAST / pixel_count, _LEFT_OUT
         (whole, missed), (trimmed, _) = estimate.errors_of_render(scale, spp, shares)
+        variances, never_found = estimate.variances, estimate.never_found()
+        if photons is not None:
+            whole, trimmed, variances = map(photons.beside, (whole, trimmed, variances))
+            missed, never_found = (
+                np.append(x + photons.lost, 0) for x in (missed, never_found)
+            )
         of_image = tuple(float((x[0] * scale**2).mean()) for x in (whole, trimmed))
+        long_run, _ = _relative_to_all(variances, scale)
         variances, uncertainty = _relative_to_all(whole, scale)
         trimmed, _ = _relative_to_all(trimmed, scale)
-        long_run, _ = _relative_to_all(estimate.variances, scale)
-        misses = estimate.never_found() > _NOTHING
+        misses = never_found > _NOTHING
         if misses[0]:
             long_run = np.where(misses, 1.0, 0.0)
         else:

@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
 from ....transport.observer import Observer
+from ....transport.vertex import PathState
 from ..partial_sums import CompetingDensities
 from .candidates import Available
 
@@ -64,12 +65,13 @@ class TechniqueObserver(Observer):
         radiance, the MIS weight ``mis`` included."""
 
     def photon(
-        self, value: mi.Spectrum, carried: mi.Spectrum, history: Any, active: mi.Bool
-    ) -> None:
-        """The camera path in each lane was merged with a vertex of a light path, whose history
-        (:class:`LightProgram`) is given; merging is the only technique. This adds ``value`` to its
-        radiance. ``carried`` is the flux of the light path, times the throughput of the camera path
-        if it goes on along the light path."""
+        self, value: mi.Spectrum, carried: mi.Spectrum, history: Any, path: PathState,
+        active: mi.Bool,
+    ) -> None:  # fmt: skip
+        """The camera path in each lane, whose state is ``path``, was merged with a vertex of a
+        light path, whose history (:class:`LightProgram`) is given; merging is the only technique.
+        This adds ``value`` to its radiance. ``carried`` is the flux of the light path, times the
+        throughput of the camera path if it goes on along the light path."""
 
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, ``count`` vertices were looked at."""

@@ -286,7 +286,9 @@ class MergedSubpaths(Subpaths):
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:
                 carried = value * vertex.path.β * (arrives / pdf)
-                self._observer.photon(brought, carried, other.history, active & (pdf > 0))
+                self._observer.photon(
+                    brought, carried, other.history, vertex.path, active & (pdf > 0)
+                )
             else:
                 self._observer.merged(brought, mis, competing, active)
         return dr.select(active, value, 0)

@@ -158,7 +158,7 @@ class PhotonsInMedia(MergedSubpaths):
                     self._channels.joined_in_medium(path, other.events, value * weight, exists)
                 if dr.hint(self._observer is not None, mode="scalar"):
                     carried = path.β * σ_s * other.β
-                    self._observer.photon(value * weight, carried, other.history, exists)
+                    self._observer.photon(value * weight, carried, other.history, path, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
@@ -180,7 +180,7 @@ class PhotonsInMedia(MergedSubpaths):
             )
             brought = value * vertex.path.β * self._per_vertex
             carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
-            self._observer.photon(brought, carried, other.history, active)
+            self._observer.photon(brought, carried, other.history, vertex.path, active)
         return value
 
     def _flux(

@@ -84,13 +84,16 @@ class HiddenLight:
     """What a photon remembers about its light.
 
     Attributes:
-        connectable: 0 if the photon left the light by way of a mirror or clear glass, so that no
-            connection leads there: only a camera path that hits the light can find the photon too.
-            1 otherwise.
+        connects_before: 1 if two vertices before the last one can be connected to each other, the
+            vertex on the light included; 0 if there is a mirror or clear glass at every other one.
+        connectable: The same with the photon as the last vertex: 0 if only a camera path that hits
+            the light can find the photon too, unless the photon can be connected to the camera
+            path.
         radiance: The radiance that such a camera path finds, in units of what the photon carries:
             radiance / power of the emitted ray. 0 for lights that no path can hit.
     """
 
+    connects_before: mi.Float
     connectable: mi.Float
     radiance: mi.Float
 
@@ -105,7 +108,7 @@ class _StoredHiddenLight(StoredHistory):
         return [history.connectable, history.radiance]
 
     def read(self, words, depth, region) -> HiddenLight:
-        return HiddenLight(*words)
+        return HiddenLight(mi.Float(0), *words)
 
 
 class HiddenLightProgram(LightProgram):
@@ -117,11 +120,16 @@ class HiddenLightProgram(LightProgram):
         density = emitted.probability * emitted.pdf_position * emitted.pdf_direction
         density *= dr.select(emitted.cosine > 0, dr.rcp(emitted.cosine), 0)
         is_delta = emitted.is_delta_position | emitted.is_delta_direction
-        one = dr.full(mi.Float, 1, dr.width(emitted.ray))
-        return HiddenLight(one, dr.select(is_delta, 0, density))
+        lanes = dr.width(emitted.ray)
+        zero, one = dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes)
+        return HiddenLight(zero, one, dr.select(is_delta, 0, density))
 
     def leave(self, history: HiddenLight, vertex, bs, reverse_pdf, passes) -> HiddenLight:
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & ~vertex.medium.scatters
         is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        is_hidden = (vertex.depth == 1) & is_delta & ~is_null
-        return HiddenLight(dr.select(is_hidden, 0, history.connectable), history.radiance)
+        before, with_last = history.connects_before, history.connectable
+        return HiddenLight(
+            dr.select(is_delta | is_null, before, with_last),
+            dr.select(is_null, with_last, dr.select(is_delta, before, 1)),
+            history.radiance,
+        )
