@@ -1,4 +1,4 @@
-"""``auto`` renders fog by photons where these pay."""
+"""``auto`` in fog: light paths, connections and photons are candidates, as on surfaces."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.estimators.light_paths.choice import photon_trial
-from mitsuba_ext.estimators.light_paths.choice.photon_trial import PhotonTrial
+from mitsuba_ext.estimators.light_paths.choice import light_paths, photon_samples
+from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
+from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathChoice, LightPathTrial
+from mitsuba_ext.estimators.light_paths.choice.photon_samples import (
+    PHOTONS,
+    PhotonEstimate,
+    PhotonSamples,
+)
 from mitsuba_ext.planning import verdicts
 from mitsuba_ext.planning.prediction_check import PredictionCheck
 from mitsuba_ext.planning.trial import Rival
-from mitsuba_ext.rendering.pass_images import FEWEST_PASSES
-from tests.support.fogs import cube, fog, homogeneous
+from mitsuba_ext.rendering.request import Request
+from tests.support.fogs import LIGHTS, SCENES, camera, fog, homogeneous, without_boundary
 from tests.support.stage import area, lookat
+from tests.support.statistical import assert_same_quarters, batches
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -23,8 +30,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
-    monkeypatch.setattr(photon_trial, "_LEAST", 1 << 14)
-    monkeypatch.setattr(photon_trial, "_SAMPLES", 1 << 11)
+    monkeypatch.setattr(photon_samples, "_LEAST", 1 << 14)
+    monkeypatch.setattr(light_paths, "_SPARSE", 1 << 11)
+    monkeypatch.setattr(light_paths, "_MOST", 1.0)
 
 
 def make(name: str = "auto", **parameters: Any) -> mi.Integrator:
@@ -43,73 +51,106 @@ def image(integrator: mi.Integrator, scene: mi.Scene, spp: int = 64, seed: int =
     return np.array(integrator.render(scene, spp=spp, seed=seed))
 
 
-def test_photons_render_light_that_camera_paths_miss(tmp_path) -> None:
+def use(monkeypatch: pytest.MonkeyPatch, wanted: Candidate) -> list[LightPathTrial]:
+    """Makes all trials choose the same candidate. Returns a list that will hold these trials."""
+    trials, choose = [], LightPathTrial.choose
+
+    def chosen(trial: LightPathTrial, rival: Rival) -> LightPathChoice:
+        choose(trial, rival)
+        trials.append(trial)
+        trial._best = trial.candidates.index(wanted)
+        trial._choice = LightPathChoice(wanted)
+        trial.check = PredictionCheck(trial._film, trial._coarse, trial.predicted.of_path)
+        return trial._choice
+
+    monkeypatch.setattr(LightPathTrial, "choose", chosen)
+    monkeypatch.setattr(PredictionCheck, "failed", lambda *_: False)
+    return trials
+
+
+def test_light_that_camera_paths_miss_is_rendered(tmp_path) -> None:
     scene, file = mi.load_dict(beam_through_glass()), str(tmp_path / "learned.npz")
     auto = make(save_learned=file)
     found = image(auto, scene)
     effect = auto.statistics.effects["light_paths"]
-    assert "photons pay" in auto.statistics.learned and effect["is_kept"]
-    assert list(auto.statistics.effects) == ["light_paths"]
-    expected = image(make("sppm"), scene, 256)
+    assert "light paths pay: " in auto.statistics.learned and effect["is_kept"]
+    assert effect["missed_by_path"] > 0.5
+    expected = image(make("bdpt"), scene, 256)
     assert found.mean() == pytest.approx(expected.mean(), rel=0.1)
     again = make(load_learned=file)
     assert image(again, scene, 16).mean() == pytest.approx(expected.mean(), rel=0.1)
-    assert again.statistics.learned.endswith("photons pay")
+    assert "light paths pay: " in again.statistics.learned
 
 
-def test_photons_replace_camera_paths_of_more_variance(monkeypatch: pytest.MonkeyPatch) -> None:
-    def failed(check: PredictionCheck, time: float, rival: float) -> bool:
-        assert check.images.count >= FEWEST_PASSES and time < 1 and rival < 1
-        check.variance = 100.0
-        return True
-
-    monkeypatch.setattr(verdicts, "is_worth", lambda *_: False)
-    monkeypatch.setattr(PredictionCheck, "failed", failed)
+def test_a_choice_of_photons_leaves_nothing_to_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    use(monkeypatch, PHOTONS)
     scene, auto = mi.load_dict(beam_through_glass()), make()
     found = image(auto, scene)
-    effect = auto.statistics.effects["light_paths"]
-    assert "photons pay" in auto.statistics.learned and effect["is_kept"]
     assert list(auto.statistics.effects) == ["light_paths"]
-    assert effect["measured_variance"] == pytest.approx(100 * effect["variance"], rel=0.01)
-    # The pilots, which miss this light, are not part of the image
+    assert "light paths pay: photons" in auto.statistics.learned
     assert found.mean() == pytest.approx(image(make("sppm"), scene, 256).mean(), rel=0.1)
 
 
-def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_lamps_in_glass(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    glass, air = (
-        {"type": "sphere", "center": [0, 0.4, 0], "radius": radius,
-         "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside}}
-        for radius, inside, outside in ((0.3, 1.5, 1.0), (0.28, 1.0, 1.5))
-    )  # fmt: skip
-    glass["exterior"] = {"type": "ref", "id": "around"}
-    lamp = {"type": "sphere", "center": [0, 0.4, 0], "radius": 0.15, "emitter": area(18.0)}
-    scene = mi.load_dict({
-        "type": "scene", "around": {**homogeneous(), "id": "around"}, **fog(), "light": lamp,
-        "fog": cube({"type": "ref", "id": "around"}), "glass": glass, "air": air,
-    }, optimize=False)  # fmt: skip
-    moments, choose = [], PhotonTrial.choose
-
-    def chosen(trial: PhotonTrial, rival: Rival) -> Any:
-        path = np.concatenate(trial._path.passes)
-        moments.append((trial._hidden(), np.mean(path**2, axis=0)))
-        return choose(trial, rival)
-
-    monkeypatch.setattr(PhotonTrial, "choose", chosen)
-    monkeypatch.setattr(photon_trial, "_PATH_PASSES", 64)
-    image(make(), scene)
-    hidden, found = (values.reshape(16, 16) for values in moments[0])
-    # Beside the lamp, which the camera sees
-    np.testing.assert_allclose(hidden[10:].sum(), found[10:].sum(), rtol=0.3)
-
-
 def test_camera_paths_render_fog_that_they_find_lit() -> None:
-    scene = mi.load_dict(fog("area"))
-    auto, auto_path = make(), make("auto_path")
-    # Passes of pilots differ
-    assert image(auto, scene).mean() == pytest.approx(image(auto_path, scene).mean(), rel=0.02)
-    assert "photons do not pay" in auto.statistics.learned
+    auto = make()
+    image(auto, mi.load_dict(fog("area")))
+    assert "light paths do not pay" in auto.statistics.learned
     effect = auto.statistics.effects["light_paths"]
     assert not effect["is_kept"] and effect["variance"] * effect["time"] > 1
-    assert 0 < effect["measured_variance"] < effect["variance"] * effect["time"]
+
+
+def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_a_lamp_behind_glass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Light scatters once in a ball of smooth glass, and no connection passes its surface."""
+
+    def milk(albedo: float) -> mi.Scene:
+        ball = {"type": "sphere", "radius": 1.5, "bsdf": {"type": "dielectric"},
+                "interior": homogeneous(0.5, albedo, 0.0)}  # fmt: skip
+        lamp = {"type": "sphere", "center": [0, 6, 0], "radius": 2.0, "emitter": area(5.0)}
+        return mi.load_dict({"type": "scene", "sensor": camera(), "ball": ball, "light": lamp})
+
+    estimates, estimate = [], PhotonSamples.estimate
+
+    def remembered(samples: PhotonSamples) -> PhotonEstimate:
+        estimates.append(estimate(samples))
+        return estimates[-1]
+
+    monkeypatch.setattr(PhotonSamples, "estimate", remembered)
+    image(make(max_depth=4), milk(0.8))
+    nested = {"type": "volpath", "max_depth": 4}
+    squares = [
+        image(mi.load_dict({"type": "moment", "nested": nested}), milk(albedo), 2048)[..., -3:]
+        for albedo in (0.8, 0.0)  # the second without scattered light
+    ]
+    expected = np.subtract(*squares).mean(axis=2).sum()
+    assert estimates[0].hidden.sum() == pytest.approx(expected, rel=0.1)
+
+
+#: Scenes, and what renders them.
+CHOICES = {
+    "lamp_inside": Candidate(1 / 4, connections=2),
+    "around_the_camera": Candidate(1.0),
+    "grid": Candidate(1 / 16, connections=4),
+    "sky": Candidate(4.0, connections=0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHOICES)
+def test_no_choice_changes_the_mean(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    use(monkeypatch, CHOICES[name])
+    scene = mi.load_dict(SCENES[name](), optimize=False)
+    images = batches(scene, make(), 256, range(1, 9))
+    expected = batches(scene, make("volpath"), 1024, range(1001, 1009))
+    assert_same_quarters(images, expected, 0.015)
+
+
+def test_light_paths_that_cannot_begin_are_no_candidate() -> None:
+    """Light from infinity, through fog without a boundary."""
+    plans = []
+    for light in ("area_inside", "environment"):
+        scene = mi.load_dict(without_boundary() | {"light": LIGHTS[light]})
+        plans.append(make().plan_learning(Request(scene, scene.sensors()[0]), 64))
+    assert [bool(plan.trial) for plan in plans] == [True, False]
+    assert plans[0].pilots == plans[1].pilots

@@ -128,8 +128,10 @@ class HiddenLightProgram(LightProgram):
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & ~vertex.medium.scatters
         is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         before, with_last = history.connects_before, history.connectable
+        # Radiance is smaller by η² in air than in glass; what photons carry is the same
+        η = dr.select(vertex.medium.scatters, 1, bs.eta)
         return HiddenLight(
             dr.select(is_delta | is_null, before, with_last),
             dr.select(is_null, with_last, dr.select(is_delta, before, 1)),
-            history.radiance,
+            history.radiance * dr.square(η),
         )
