@@ -45,7 +45,7 @@ class Auto(LightPathIntegrator):
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
     guided directions, learned lights, and maps of times, lens points, wavelengths and distances
     (:class:`auto_path`); light paths, their number, the number of connections to them, and merging
-    with them (:class:`vcm`); in fog, photons (:class:`sppm`).
+    with them (:class:`vcm`; in participating media, :class:`bdpt` and :class:`sppm`).
 
     .. pluginparameters::
 
@@ -111,17 +111,17 @@ class Auto(LightPathIntegrator):
     times the predicted time, exceeds the value without light paths by more than the error of the
     measurement. (Everything else that is learned is tested in each pilot.)
 
-    In scenes with participating media, photons are the only alternative to camera paths. They are
-    rendered as in :class:`sppm`. Renders of two million samples or more try photons on a coarse
-    film, in addition to camera paths. The photons also show how rarely camera paths find the light
-    of lamps in or behind glass, to which they cannot be connected. If camera paths are kept, the
-    later pilots show their actual variance, with all that was learned for them. If photons would be
-    better, they render the last stage. Once photons are chosen, this choice is not tested again.
+    In scenes with participating media, vertices are not merged beside other techniques. Instead,
+    photons alone are a candidate, which are rendered as in :class:`sppm`. The trial has samples of
+    them in renders of two million samples or more. The photons also show how rarely camera paths
+    find light that no connection reaches: light that enters clear glass, scatters once in a medium
+    there, and leaves the glass. If photons are chosen, nothing else is learned, so that no pilots
+    are left to test this choice.
 
     Light paths are not tried in films for whose pixels a third of the memory does not suffice (two
-    million pixels with 16 GiB), nor if a light cannot emit them: the integrator then works as
-    :class:`auto_path`. In spectral variants and with moving shapes, nothing is merged, and there
-    are no photons in media.
+    million pixels with 16 GiB), if a light cannot emit them, or if light from infinity shines
+    through a medium without a boundary: the integrator then works as :class:`auto_path`. In
+    spectral variants and with moving shapes, nothing is merged, and there are no photons.
 
     If vertices are merged, or photons are used, the image is slightly blurred, less with each
     sample (:class:`vcm`, :class:`sppm`).

@@ -46,7 +46,8 @@ class TreeChoice(EmitterSampling):
             chosen, weights = np.arange(cells.count), cells.share
         lights, is_infinite = cell_bounds(scene, cells, weights)
         trees = build_trees(lights.at(chosen), apart=is_infinite[chosen])
-        self._tree = LightTree(trees, may_have_media(scene))
+        self._in_media = may_have_media(scene)
+        self._tree = LightTree(trees, self._in_media)
         self._opaque = opaque_bsdfs(scene)
         # Cells of which light, and lights of which cell; there is one more for cells without light
         number = np.full(cells.count, len(chosen))
@@ -61,6 +62,9 @@ class TreeChoice(EmitterSampling):
 
     def visit(self, state, scene, si, active):
         normal = dr.mulsign(si.sh_frame.n, si.wi.z)
+        if self._in_media:
+            # The frame of a vertex in a medium depends on where the path comes from
+            normal = dr.select(si.shape == None, mi.Normal3f(0), normal)  # noqa: E711
         return Receiver(normal, active & is_in_table(self._opaque, si.bsdf()))
 
     def sample(self, place, scene, numbers, si, active):
