@@ -1,4 +1,4 @@
-"""Does ``auto`` choose well between photons and camera paths in fog?
+"""Does ``auto`` choose well between light paths, photons and camera paths in fog?
 
     python benchmarks/fog.py                                # all scenes
     python benchmarks/fog.py fog sun --seeds 3 --integrator sppm --integrator auto
@@ -57,7 +57,7 @@ def cells(integrator: dict[str, Any]) -> list[str]:
 @click.option("--seeds", default=3, help="Renders of each integrator.")
 @click.option("--size", type=(int, int), default=(160, 90), help="Of the film.")
 @click.option("--reference-spp", default=1024, help="Samples per pixel of references.")
-@click.option("--reference", default="", help="Their integrator; sppm or composed_path by default.")
+@click.option("--reference", default="", help="Their integrator; none for variances.")
 def main(
     names: tuple[str, ...], kinds: tuple[str, ...], spp: int, seeds: int, size: tuple[int, int],
     reference_spp: int, reference: str,
@@ -67,11 +67,18 @@ def main(
     print_header(["scene", "integrator", "efficiency", "relMSE", "seconds", "mean", "learned"])
     for name in names or (*FILES, *FOGS):
         source = FOGS[name](*size) if name in FOGS else SCENES / f"{name}.xml"
+        rendered = {"with_reference": False} if reference == "none" else {
+            "reference_spp": (
+                reference_spp if reference else _REFERENCE_SPP.get(name, reference_spp)
+            ),
+            "reference_integrator": reference or (
+                "sppm" if name in _BY_PHOTONS else "composed_path"
+            ),
+        }  # fmt: skip
         comparison = compare.Comparison(
             compare.SceneSetup(source, size, changes=compare.SceneChanges(None, "box", 8)),
             kinds, compare.equal_samples(spp or SPP.get(name, 256)), seeds, FOLDER / name,
-            reference_spp if reference else _REFERENCE_SPP.get(name, reference_spp),
-            reference or ("sppm" if name in _BY_PHOTONS else "composed_path"), cpu_time=True,
+            cpu_time=True, **rendered,
         )  # fmt: skip
         for integrator in comparison.run()["scenes"][0]["integrators"]:
             print_row([name, integrator["label"], *cells(integrator)])

@@ -257,6 +257,12 @@ def test_vertices_in_a_medium_have_no_horizon():
         "fog": fog, "floor": rectangle(translate(0, 0, -0.5), bsdf=diffuse()),
         **{f"p{i}": point(0.5 * i - 1, 1.5 * (-1) ** i, 0.3 * i) for i in range(5)},
     })  # fmt: skip
+    # Else camera paths and light paths would disagree on the probabilities
+    point_in_fog, choice = dr.zeros(mi.SurfaceInteraction3f, 2), tree_choice(scene)
+    point_in_fog.wi, point_in_fog.sh_frame = [0, 0, 1], mi.Frame3f([[0, 1], [0, 0], [1, 0]])
+    place = choice.visit(choice.begin(None, None), scene, point_in_fog, mi.Bool(True))
+    first, second = choice.of_cell(mi.UInt32(1), place, mi.Interaction3f(point_in_fog), True)
+    assert first == second
     tree = mi.load_dict({"type": "composed_path", "max_depth": 4, "next_event": "tree"})
     uniform = mi.load_dict({"type": "composed_path", "max_depth": 4})
     a, b = (batches(scene, each, 128, SEEDS[i : i + 4]) for i, each in ((0, tree), (4, uniform)))
