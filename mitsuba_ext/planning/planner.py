@@ -267,23 +267,13 @@ class Planner(Schedule):
         trial = self._trial
         if not self.is_at_end:
             return stage if trial.check is None else replace(stage, images=trial.check.images)
-        choice, discards = trial.reconsider(self._rival, self._time_alone(), self._margin), False
-        if choice is not None and self._take_up_again is not None:
+        if trial.reconsider(self._rival) is not None:
             self.decide(light_paths=None)
             self._take_up_again()
-        elif choice is not None:
-            self._leave_out()
-            self.decide(light_paths=choice)
-            discards = trial.chosen_variance < verdicts.FAR_LESS
-        return replace(self._stage(), discards_earlier=discards or self._discards_pilots)
+        return replace(self._stage(), discards_earlier=self._discards_pilots)
 
     def _finds_all_light(self, slot: str) -> bool:
         return self._techniques[slot].finds_all_light
-
-    def _time_alone(self) -> float:
-        """The time of a camera path with what was learned for it, relative to ``path``."""
-        effects = [x.effect for slot, x in self.learners.items() if self._finds_all_light(slot)]
-        return math.prod(x.time for x in effects if x is not None and x.is_kept and x.time)
 
     def _leave_out(self) -> Callable[[], None]:
         """Decides as ``path`` from now on in the slots that the trial leaves out, and learns no

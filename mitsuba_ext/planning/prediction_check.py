@@ -24,10 +24,6 @@ class PredictionCheck:
         coarse: That of the trial.
         of_rival: The squared error of one sample of what was not chosen, in each pixel of the
             coarse film.
-        least: The least variance of what was chosen, in the same pixels: some may be due to paths
-            that are too rare to be seen in the images.
-        weight: The weight of squared errors in these pixels; ``None`` for that which follows from
-            the images. There, a rare bright sample makes its own pixel bright, and weigh little.
 
     Attributes:
         images: The images of the stages after the trial.
@@ -35,16 +31,9 @@ class PredictionCheck:
         error: The standard error of its logarithm.
     """
 
-    def __init__(
-        self,
-        film: mi.Film,
-        coarse: CoarseFilm,
-        of_rival: np.ndarray,
-        least: np.ndarray | float = 0.0,
-        weight: np.ndarray | None = None,
-    ) -> None:
-        self._film, self._coarse, self._of_rival, self._least = film, coarse, of_rival, least
-        self._weight, self.images = weight, PassImages(film)
+    def __init__(self, film: mi.Film, coarse: CoarseFilm, of_rival: np.ndarray) -> None:
+        self._film, self._coarse, self._of_rival = film, coarse, of_rival
+        self.images = PassImages(film)
         self.variance: float | None = None
         self.error = 0.0
 
@@ -59,9 +48,7 @@ class PredictionCheck:
         if self.images.count < 2:
             return False
         variance, mean = self._on_coarse_film(self.images.variance(), self.images.mean())
-        variance, weight = np.maximum(variance, self._least), self._weight
-        if weight is None:
-            weight = relative_scale(mean.reshape(self._coarse.height, -1), 1).ravel() ** 2
+        weight = relative_scale(mean.reshape(self._coarse.height, -1), 1).ravel() ** 2
         # Pixels are left out where either is largest
         sums = trimmed_batches(variance * weight, (self._of_rival - variance) * weight)
         gain, self.error = gain_of(sums)

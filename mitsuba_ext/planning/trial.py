@@ -60,14 +60,11 @@ class Trial(Learner):
         :class:`~mitsuba_ext.planning.technique.Technique`."""
         return finds_all_light
 
-    def reconsider(self, rival: Rival, time: float, margin: float) -> Any | None:
+    def reconsider(self, rival: Rival) -> Any | None:
         """The other decision, if the check has failed; ``None`` if nothing changes.
 
         Parameters:
             rival: What the choice has to beat now.
-            time: The time of a camera path with what was learned for it, relative to ``path``.
-            margin: The efficiency that what was tried must have, in units of the efficiency of
-                camera paths.
         """
         raise NotImplementedError
 

@@ -248,7 +248,7 @@ class LightPathTrial(Trial):
         self.check = PredictionCheck(self._film, self._coarse, predicted.of_path)
         return self._choice
 
-    def reconsider(self, rival: Rival, time: float, margin: float) -> LightPathChoice | None:
+    def reconsider(self, rival: Rival) -> LightPathChoice | None:
         """``path``, if light paths have more variance than predicted, and less efficiency."""
         self.rival = rival
         least = rival.efficiency / self._of_guides(self._choice.techniques)
