@@ -65,8 +65,8 @@ class PhotonSamples(TechniqueObserver):
     samples in the pass do not reduce. Several passes, which have photons of their own, tell the two
     kinds apart.
 
-    Some light is hidden from all connections: light that enters a smooth glass from a lamp in it,
-    or the other way round, with a single scattering between the lamp's glass and the camera's. A
+    Some light is hidden from all connections, because no two neighbouring vertices of its paths can
+    be connected: it enters smooth glass, scatters once in it, and leaves the glass elsewhere. A
     camera path has to hit the lamp, which it does too rarely for the samples of a trial. But
     photons find this light (:class:`HiddenLight`). Let a photon bring f / p to a pixel, where a
     camera path of density q, which hits the lamp, brings f / q, about the lamp's radiance. The
@@ -77,6 +77,8 @@ class PhotonSamples(TechniqueObserver):
     Parameters:
         coarse: The film.
         spp: Samples per pixel of the render.
+
+    Attributes:
         has_image: Whether the other candidates connect light paths to the sensor.
     """
 
@@ -97,7 +99,7 @@ class PhotonSamples(TechniqueObserver):
 
     def beside(self, estimator: Estimator, mapper: PhotonMapper, has_image: bool) -> WithPhotons:
         """An estimator of the trial: after the samples of ``estimator``, it takes samples of
-        photons, which ``mapper`` renders on the whole film."""
+        photons. ``mapper`` is for the whole film."""
         self._mapper, self.has_image = mapper, has_image
         coarse = mapper.of_coarse_film(self._coarse.pixel_width)
         light_walk = replace(coarse.light_walk, program=HiddenLightProgram())
