@@ -16,7 +16,7 @@ from mitsuba_ext.estimators.light_paths.choice.photon_samples import (
     PhotonEstimate,
     PhotonSamples,
 )
-from mitsuba_ext.planning import verdicts
+from mitsuba_ext.planning import planner, verdicts
 from mitsuba_ext.planning.prediction_check import PredictionCheck
 from mitsuba_ext.planning.trial import Rival
 from mitsuba_ext.rendering.request import Request
@@ -29,7 +29,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Although renders are short
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
+    monkeypatch.setattr(planner, "LIGHT_PATH_KERNELS", 0.0)
     monkeypatch.setattr(photon_samples, "_LEAST", 1 << 14)
     monkeypatch.setattr(light_paths, "_SPARSE", 1 << 11)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)

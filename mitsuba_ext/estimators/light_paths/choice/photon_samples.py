@@ -121,11 +121,11 @@ class PhotonSamples(TechniqueObserver):
     ) -> None:  # fmt: skip
         brought = channel_mean(value * self._importance)
         hit = channel_mean(carried * self._importance) * history.radiance
-        is_hidden = active & history.is_hidden & dr.isfinite(brought * hit)
-        # Nor does a connection to the camera, or to the surface before
+        # A connection from the camera path: the photon is at its next vertex
         is_first = path.depth == 0
-        is_hidden &= ~is_first if self.has_image else mi.Bool(True)
-        is_hidden &= is_first | path.arrival.is_delta
+        is_found = is_first if self.has_image else mi.Bool(False)
+        is_found |= ~is_first & ~path.arrival.is_delta
+        is_hidden = active & history.is_hidden & ~is_found & dr.isfinite(brought * hit)
         add_own(self._moment, brought * hit, self._lane, is_hidden)
         add_own(self._lost, brought, self._lane, is_hidden & (history.radiance == 0))
 
@@ -166,16 +166,17 @@ class PhotonSamples(TechniqueObserver):
             radius.samples_per_vertex(mapper.light_paths, in_pass)
             for radius in (mapper.radius, mapper.ball) if radius is not None
         )  # fmt: skip
-        mean = box_means(values.mean(axis=(0, 1)).reshape(-1, self._coarse.width)).ravel()
-        bias = _SQUARED_BIAS * np.sqrt(self._spp) * mean**2
+        mean = values.mean(axis=(0, 1))
+        bias = _SQUARED_BIAS * np.sqrt(self._spp) * self._smooth(mean) ** 2
         moment, lost = np.mean(self._hidden, axis=(0, 2))
-        share = lost.sum() / max(values.mean(axis=(0, 1)).sum(), 1e-30)
-        lost = box_means(lost.reshape(-1, self._coarse.width)).ravel()
+        share = lost.sum() / max(mean.sum(), 1e-30)
+        least = moment + self._spp * self._smooth(lost) ** 2
         counts = Counts()
         counts.add(*(x / passes for x in vars(self._counts).values()))
-        return PhotonEstimate(
-            mean, own + shared * of_photons + bias, moment + self._spp * lost**2, share, counts
-        )
+        return PhotonEstimate(mean, own + shared * of_photons + bias, least, share, counts)
+
+    def _smooth(self, values: np.ndarray) -> np.ndarray:
+        return box_means(values.reshape(-1, self._coarse.width)).ravel()
 
 
 @dataclass
