@@ -114,8 +114,8 @@ def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_a_lamp_behi
 
     estimates, estimate = [], PhotonSamples.estimate
 
-    def remembered(samples: PhotonSamples) -> PhotonEstimate:
-        estimates.append(estimate(samples))
+    def remembered(samples: PhotonSamples, found: np.ndarray) -> PhotonEstimate:
+        estimates.append(estimate(samples, found))
         return estimates[-1]
 
     monkeypatch.setattr(PhotonSamples, "estimate", remembered)

@@ -229,7 +229,7 @@ class LightPathTrial(Trial):
     def choose(self, rival: Rival) -> LightPathChoice | None:
         moments, self._moments, self.rival = self._moments, None, rival
         self.candidates, self.estimate = list(moments.candidates), moments.estimate()
-        photons = self._choice.photons and self._choice.photons.estimate()
+        photons = self._choice.photons and self._choice.photons.estimate(self.estimate.mean)
         self.predicted = predicted = PredictedErrors.of(
             self.estimate, self._width, self._spp, self._pixel_count, photons
         )

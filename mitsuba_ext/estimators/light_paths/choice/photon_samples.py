@@ -28,6 +28,10 @@ _LEAST, _PASSES = 1 << 21, 2
 #: the number of samples. (After 64, it was 0.012 in volume_caustic, and 0 to 0.001 in four others.)
 _SQUARED_BIAS = 0.03
 
+#: The share of the pixels, the brightest ones, that do not tell how much light photons have found:
+#: rare samples of other candidates may be in them.
+_BRIGHTEST = 0.01
+
 #: The candidate that :class:`PhotonMapper` renders.
 PHOTONS = Candidate(1.0, connections=0, merges=True)
 
@@ -37,7 +41,7 @@ class PhotonEstimate:
     """What the passes of photons have found for each pixel, [pixel] each.
 
     Attributes:
-        mean: Radiance.
+        mean: Radiance, without the noise of rare samples of other candidates.
         variance: The squared error of one sample of photons: of a render, times its number of
             samples.
         hidden: The least squared error of one sample of all other candidates: the part due to light
@@ -154,20 +158,27 @@ class PhotonSamples(TechniqueObserver):
 
     # ---- After the passes ----
 
-    def estimate(self) -> PhotonEstimate:
-        """The estimate from all passes."""
+    def estimate(self, found: np.ndarray) -> PhotonEstimate:
+        """The estimate from all passes. ``found``: the radiance of each pixel that the other
+        candidates have found."""
         values = np.array(self._passes)
         passes, samples, _ = values.shape
         own = values.var(axis=1, ddof=1).mean(axis=0)
         of_photons = values.mean(axis=1).var(axis=0, ddof=1) - own / samples
+        mean = values.mean(axis=(0, 1))
+        # Few photons of a large light may reach what the camera sees. In all passes, less than one
+        # photon is expected to bring the light that is missing. (Less than half of it: noise.)
+        usual = np.minimum(found, np.quantile(found, 1 - _BRIGHTEST))
+        missing = np.maximum(self._smooth(usual) - 2 * self._smooth(mean), 0)
+        of_photons = np.maximum(of_photons, passes * missing**2)
+        mean = mean + missing
         mapper = self._mapper
         in_pass = min(self._spp, max(1, mapper.most_lanes // self._coarse.pixel_count))
         shared = max(
             radius.samples_per_vertex(mapper.light_paths, in_pass)
             for radius in (mapper.radius, mapper.ball) if radius is not None
         )  # fmt: skip
-        mean = values.mean(axis=(0, 1))
-        bias = _SQUARED_BIAS * np.sqrt(self._spp) * self._smooth(mean) ** 2
+        bias = _SQUARED_BIAS * np.sqrt(self._spp) * mean**2
         moment, lost = np.mean(self._hidden, axis=(0, 2))
         share = lost.sum() / max(mean.sum(), 1e-30)
         least = moment + self._spp * self._smooth(lost) ** 2
