@@ -250,7 +250,7 @@ def test_pilots_learn_seeds(tmp_path) -> None:
     integrator = mi.load_dict({
         "type": "composed_path", "max_depth": 6, "caustics": "manifold", "save_learned": file,
     })  # fmt: skip
-    mi.render(scene, integrator=integrator, spp=64)
+    mi.render(scene, integrator=integrator, spp=128)
     assert "seeds of chains in" in integrator.statistics.learned
     learned = integrator.learners["caustics"].state()
     assert len(learned["seeds"]) > 1
