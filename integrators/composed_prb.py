@@ -100,7 +100,9 @@ class ComposedPRB(common.RBIntegrator):
     derivatives), and parameters of phase functions. **Not when** you optimize the position or shape
     of objects, or the camera (use :monosp:`prb` or :monosp:`prb_projective`): these are refused,
     and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth glass have no
-    gradients (a warning names them), nor has the opacity of masks where light passes. Gradients of
+    gradients (a warning names them), nor has the opacity of masks where light passes. The same
+    holds for the mirror of a :monosp:`plastic`. (:monosp:`prb` counts its light as light of the
+    diffuse lobe, so that gradients of :monosp:`diffuse_reflectance` are biased.) Gradients of
     exactly black colours, of an albedo of 0, and of a homogeneous extinction of 0 lack the light
     that scattered rays would have found.
 
@@ -108,8 +110,8 @@ class ComposedPRB(common.RBIntegrator):
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
     that the path has gathered so far, so the rest of its radiance is known. All densities, MIS
     weights and learned maps are treated as constants. With all defaults, and except with respect to
-    roughness, gradients are the same as with :monosp:`prb`, from the same random numbers up to
-    :monosp:`rr_depth`.
+    roughness and of BSDFs such as :monosp:`plastic`, gradients are the same as with :monosp:`prb`,
+    from the same random numbers up to :monosp:`rr_depth`.
 
     If the roughness of a conductor, a dielectric or a metallic :monosp:`principled` is optimized,
     samples form pairs where a camera ray meets it, if it is not very rough and not seen at a

@@ -87,9 +87,9 @@ class FirstPass:
         ``way`` is the way of the light through media; ``None`` if the scene has none."""
 
     def scattered(
-        self, vertex: Vertex, wo: mi.Vector3f, L: mi.Spectrum, active: mi.Bool
+        self, vertex: Vertex, bs: mi.BSDFSample3f, L: mi.Spectrum, active: mi.Bool
     ) -> None:
-        """The path continues from ``vertex`` in the direction ``wo``. It has gathered ``L`` so
+        """The path continues from ``vertex`` in the direction ``bs``. It has gathered ``L`` so
         far."""
 
 
@@ -169,8 +169,13 @@ class Replay(FirstPass):
                 gained *= _attenuation(way)
             self._propagate(dr.select(visible, gained, 0))
 
-    def scattered(self, vertex, wo, L, active):
-        later = self._L - L
+    def scattered(self, vertex, bs, L, active):
+        wo, later = bs.wo, self._L - L
+        # What a mirror reflects has no gradients, nor is it light of another lobe of the BSDF
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if vertex.medium is not None:
+            is_delta &= ~vertex.medium.scatters
+        active = active & ~is_delta
         with dr.resume_grad():
             bsdf = self._bsdf(vertex, vertex.si.to_world(wo), wo, active)
             self._propagate(dr.select(active, later * dr.relative_grad(bsdf), 0))

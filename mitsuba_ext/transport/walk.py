@@ -274,7 +274,7 @@ class Walk:
             self.observer.direction(vertex, sample_2, directions_weight, L, turns)
             self.observer.scattering(vertex, bs, active)
             if dr.hint(self.replay is not None, mode="scalar"):
-                self.replay.scattered(vertex, bs.wo, L, turns)
+                self.replay.scattered(vertex, bs, L, turns)
 
             if dr.hint(self.clamps, mode="scalar"):
                 direct = dr.select(path.depth == 0, L, direct)

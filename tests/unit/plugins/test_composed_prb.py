@@ -237,6 +237,25 @@ def test_forward_and_backward_mode_agree_with_finite_differences(kind: str) -> N
         assert abs(np.mean(found) - expected) < 4.5 * error + 0.01 * abs(expected)
 
 
+def test_light_in_the_mirror_of_a_plastic_has_no_gradient_of_its_diffuse_lobe() -> None:
+    """``prb`` counts it as light of this lobe."""
+    scene = mi.load_dict(
+        stage(floor=rectangle(mi.ScalarTransform4f().scale(2), bsdf={"type": "plastic"}),
+              sky={"type": "constant"}),
+        optimize=False,
+    )  # fmt: skip
+    parameters = small(scene)
+    (key,) = (k for k in parameters.keys() if k.endswith("floor.bsdf.diffuse_reflectance.value"))
+    found = backward(scene, parameters, [key], make(max_depth=2), 3, 512)[0].sum()
+    start, h, losses = type(parameters[key])(parameters[key]), 0.05, []
+    for step in (h, -h):
+        parameters[key] = start + step
+        parameters.update()
+        image = mi.render(scene, integrator=make("path", max_depth=2), seed=4, spp=512)
+        losses.append(float(dr.mean(image * loss_weights(), axis=None).array[0]))
+    assert found == pytest.approx((losses[0] - losses[1]) / (2 * h), rel=0.03)
+
+
 def test_black_objects_have_a_gradient() -> None:
     """A connection that carries nothing may have a derivative nonetheless."""
     scene = mi.load_dict(stage(floor=rectangle(mi.ScalarTransform4f().scale(2),
