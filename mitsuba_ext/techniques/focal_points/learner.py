@@ -121,7 +121,7 @@ class FocalLearner(Learner):
             gain, error = self._gain(lines, bsdf)
             known = records.paths / self._pilot_samples
             time = 1 + FOCAL_CHOICE + FOCAL_BOX * self.decision.density.count
-            self.discards_pilots = self._effect is None and 1 - gain < verdicts.FAR_LESS
+            is_first = self._effect is None
             self._effect = Effect(True, max(1 - gain, 1e-3), time)
             prediction = Prediction(1 - gain, time, error, known, True)
             if not (self._always or pilot.pays(prediction)):
@@ -129,6 +129,7 @@ class FocalLearner(Learner):
                 self._summary = f"no focal points: about {max(gain, 0):.0%} less variance"
                 self.decision = self._records = None
                 return None
+            self.discards_pilots = is_first and 1 - gain < verdicts.FAR_LESS
         self._fit(lines, bsdf)
         records.restart()
         return self.decision

@@ -14,6 +14,7 @@ from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
 from mitsuba_ext.techniques.focal_points.fitting import LineArrays, fitted_boxes, fitted_rows
 from mitsuba_ext.techniques.focal_points.focal_density import FocalDensity
+from mitsuba_ext.techniques.focal_points.learner import FocalLearner
 from mitsuba_ext.transport.decisions import Decisions
 from tests.support.statistical import load
 
@@ -146,6 +147,19 @@ def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
         learner.discards_pilots = said
         discards.append(planner.next_stage().discards_earlier)
     assert discards == [False, False, True, False]
+
+
+@pytest.mark.parametrize("pays", [True, False])
+def test_pilots_count_if_focal_points_do_not_pay(pays: bool, monkeypatch) -> None:
+    learner = FocalLearner(256, 5, 1.0, 100, (4, 4))
+    density = SimpleNamespace(table=np.ones((1, 257)), count=256)
+    learner.decision = SimpleNamespace(density=density)
+    learner._records = SimpleNamespace(lines=lambda: (), paths=50, restart=lambda: None)
+    monkeypatch.setattr(learner, "_bsdf_density", lambda lines: None)
+    monkeypatch.setattr(learner, "_gain", lambda lines, bsdf: (0.7, 0.0))
+    monkeypatch.setattr(learner, "_fit", lambda lines, bsdf: None)
+    learner.learn(SimpleNamespace(pays=lambda prediction: pays, is_last=False))
+    assert learner.discards_pilots == pays and (learner.decision is not None) == pays
 
 
 @pytest.mark.slow
