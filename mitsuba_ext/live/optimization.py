@@ -51,7 +51,8 @@ class OptimizationProgress:
 
     Attributes:
         losses: The loss of each step.
-        noises: The noise of the gradients at each step.
+        noises: The noise of the gradients at each step; NaN at the first step, and where there are
+            no gradients.
         seconds: The time since the first step, after each step.
         image: The last image that was added.
     """
@@ -112,6 +113,7 @@ class OptimizationProgress:
                 axis.set_yscale("log")
             axis.set_title("noise of the gradients" if name == "noise" else name)
             axis.set_xlabel("step")
+            axis.xaxis.get_major_locator().set_params(integer=True)
         for axis, name, image in zip(axes[2:], ("first image", "last image"), images):
             colours = image[..., :3] if image.shape[-1] > 3 else image  # the rest is no colour
             axis.imshow(np.squeeze(np.array(mi.util.convert_to_bitmap(colours))), cmap="gray")
@@ -142,12 +144,14 @@ class OptimizationProgress:
             squared_mean = float(dr.sum(dr.square(mean))[0]) / share**2
             means += squared_mean
             variances += float(dr.sum(square)[0]) / share - squared_mean
-        return math.sqrt(max(variances, 0) / means) if means > 0 else math.nan
+        is_known = means > 0 and len(self.losses) > 1
+        return math.sqrt(max(variances, 0) / means) if is_known else math.nan
 
     def _described(self) -> str:
         if not self.losses:
             return ""
-        return f"loss {self.losses[-1]:.4g}, noise {self.noises[-1]:.2g}"
+        loss, noise = self.losses[-1], self.noises[-1]
+        return f"loss {loss:.4g}" + ("" if math.isnan(noise) else f", noise {noise:.2g}")
 
     def _draw(self, is_last: bool) -> None:
         """Shows the plots in a notebook."""

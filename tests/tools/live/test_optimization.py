@@ -28,6 +28,8 @@ def test_loss_noise_and_images_are_recorded_and_drawn(capsys) -> None:
         optimizer.step()
     assert seen == list(range(40)) and len(progress.losses) == len(progress.seconds) == 40
     assert progress.losses[-1] == pytest.approx(float(np.mean(progress.image.numpy())), rel=1e-4)
+    # One step alone has no noise, except of rounding
+    assert np.isnan(progress.noises[0]) and np.isfinite(progress.noises[1:]).all()
     assert 0.35 < np.mean(progress.noises[-20:]) < 0.6
     assert "40/40" in capsys.readouterr().out
     figure = progress.plot()
