@@ -132,6 +132,10 @@ class FocalLearner(Learner):
             self.discards_pilots = is_first and 1 - gain < verdicts.FAR_LESS
         self._fit(lines, bsdf)
         records.restart()
+        if pilot.is_last and not self.decision.density.table[:, 0].any():
+            # The kernel of path is faster
+            self._summary = "no focal points: the pilots found none"
+            self.decision = self._records = self._effect = None
         return self.decision
 
     def _bsdf_density(self, lines: Lines) -> mi.Float:
@@ -189,7 +193,8 @@ class FocalLearner(Learner):
     def __str__(self) -> str:
         if self._effect is None or self.decision is None:
             return self._summary
-        return f"{self._summary}, about {1 - self._effect.variance:.0%} less variance"
+        less = 1 - self._effect.variance
+        return f"{self._summary}, about {abs(less):.0%} {'more' if less < 0 else 'less'} variance"
 
 
 def _chosen(lines: Lines, bsdf: mi.Float, value: np.ndarray, most: int) -> LineArrays:

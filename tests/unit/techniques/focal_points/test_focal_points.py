@@ -162,6 +162,18 @@ def test_pilots_count_if_focal_points_do_not_pay(pays: bool, monkeypatch) -> Non
     assert learner.discards_pilots == pays and (learner.decision is not None) == pays
 
 
+def test_without_boxes_directions_are_sampled_as_in_path(monkeypatch) -> None:
+    learner = FocalLearner(32, 5, 1.0, 100, (4, 4))
+    learner._records = SimpleNamespace(lines=lambda: (), paths=50, restart=lambda: None)
+    learner.decision = SimpleNamespace(density=FocalDensity.nothing(2))
+    monkeypatch.setattr(learner, "_bsdf_density", lambda lines: None)
+    monkeypatch.setattr(learner, "_fit", lambda lines, bsdf: None)
+    # The next pilot may find some
+    assert learner.learn(SimpleNamespace(is_last=False)) is not None
+    assert learner.learn(SimpleNamespace(is_last=True)) is None
+    assert str(learner) == "no focal points: the pilots found none"
+
+
 @pytest.mark.slow
 def test_light_through_a_keyhole_is_found() -> None:
     """Directions lead to the keyhole, and the unguided pilots do not count towards the image."""
