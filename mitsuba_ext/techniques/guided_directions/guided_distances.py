@@ -75,15 +75,17 @@ class GuidedDistances(Distances):
     def warp(self, u, ray, si, σ, σ_s, active):
         # A branch, so that flights that are not guided cost nothing
         return dr.if_stmt(
-            (u, ray.o, ray.d, si, σ, σ_s),
+            (u, ray.o, ray.d, ray.maxt, si, σ, σ_s),
             active & (σ > 0),
             self._warp,
-            lambda u, o, d, si, σ, σ_s: (si.t, mi.Bool(False), mi.Float(1)),
+            lambda u, o, d, end, si, σ, σ_s: (si.t, mi.Bool(False), mi.Float(1)),
         )
 
-    def _warp(self, u, o, d, si, σ, σ_s):
-        # The probability of a collision before the surface, and the width of a cell
-        collides = 1 - dr.select(dr.isfinite(si.t), dr.exp(-σ * si.t), 0)
+    def _warp(self, u, o, d, end, si, σ, σ_s):
+        # Camera rays end at the far clip plane
+        end = dr.minimum(si.t, end)
+        # The probability of a collision before that, and the width of a cell
+        collides = 1 - dr.select(dr.isfinite(end), dr.exp(-σ * end), 0)
         width = collides / mi.Float(self._cells)
         warps = u < SHARE
         u = dr.select(warps, u / SHARE, (u - SHARE) / (1 - SHARE))
@@ -97,7 +99,8 @@ class GuidedDistances(Distances):
             mi.Float, self.surfaces, self.regions.label(si, None, mi.Bool(True))
         )
         # Where the surface is unknown, the probability of a collision remains
-        of_surface = dr.select(of_surface < 0, of_medium, of_surface)
+        is_known = si.is_valid() & (of_surface >= 0)
+        of_surface = dr.select(is_known, of_surface, of_medium)
         mean = collides * of_medium + (1 - collides) * of_surface
         warps &= mean > 0
         scattered = collides * of_medium / mean
@@ -108,7 +111,7 @@ class GuidedDistances(Distances):
         scatters = dr.select(warps, ~passes, u < collides)
         density = dr.select(scatters, of_cell, of_surface) / mean
         density = dr.select(mean > 0, density, 1)
-        t = dr.select(scatters, dr.minimum(-dr.log(1 - number) / σ, si.t), si.t)
+        t = dr.select(scatters, dr.minimum(-dr.log(1 - number) / σ, end), si.t)
         return t, scatters, dr.rcp(dr.fma(SHARE, density, 1 - SHARE))
 
     @dr.syntax

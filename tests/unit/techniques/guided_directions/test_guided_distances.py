@@ -94,6 +94,21 @@ def test_paths_scatter_where_light_arrives() -> None:
     assert scatters.mean() == pytest.approx((1 - SHARE) * (1 - np.exp(-0.75)), abs=5e-3)
 
 
+def test_paths_do_not_scatter_behind_the_far_clip_plane() -> None:
+    """No surface is met before it."""
+    u = np.random.default_rng(5).random(LANES, dtype=np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    si.t = mi.Float(np.inf)
+    ray = mi.Ray3f(mi.Point3f(1, 1, 1e-3), mi.Vector3f(0, 0, 1))
+    ray.maxt = mi.Float(1.0)
+    arguments = (mi.Float(0.5), mi.Float(0.4), mi.Bool(True))
+    found = _distances(100.0).warp(mi.Float(u), ray, si, *arguments)
+    t, scatters, weight = (x.numpy() for x in found)
+    assert (t[scatters] <= 1).all()
+    missed = weight[~scatters]
+    assert abs(missed.sum() - LANES * np.exp(-0.5)) < 4 * np.linalg.norm(missed)
+
+
 @pytest.mark.parametrize("σ, dark, surface", [(0.5, True, -1.0), (0.5, True, 0.0), (0.0, False, 1)])
 def test_where_nothing_is_known_all_weights_are_one(σ: float, dark: bool, surface: float) -> None:
     _, scatters, weight = _flights(_distances(surface, dark), σ, 1.0)
