@@ -41,7 +41,7 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
        - |float|
        - As ``radius``, for vertices in participating media, which are merged in a ball: a pass of k
          samples per pixel uses 1/k of the volume. 0 stands for a radius with which half of the
-         balls contain about eight vertices or more. (Default: 0)
+         balls contain about eight vertices or more, but at most two mean free paths. (Default: 0)
      * - radius_decay
        - |float|
        - α, in (0, 1]: the squared radius of pass i (in media, its cube) is the squared radius (or

@@ -15,8 +15,10 @@ import math
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ....transport.vertex import Vertex
+from ....util.arrays import to_host
 from ..light_vertices import LightVertex, VertexCache
 from ..medium_scattering import MediumTerms
 from .merging import (
@@ -34,6 +36,9 @@ from .vertex_grid import Kept, VertexCounts
 #: surfaces, because few camera paths scatter in a beam of light, and these meet many photons there.
 #: Variance with 8, 24 and 80: mirrored_beam 0.097, 0.063, 0.049; volume_caustic 0.37, 0.39, 0.53.)
 PHOTONS_PER_SAMPLE = 24.0
+
+#: The largest radius of a ball, in mean free paths.
+_FREE_PATHS = 2.0
 
 #: The largest radius of a ball, in footprints of pixels.
 _WIDEST_BALL = 20.0
@@ -100,7 +105,10 @@ def suitable_ball(
 ) -> float | None:
     """The radius in which a ball holds ``PHOTONS_PER_DISK`` vertices, with one light path per
     pixel: the median over the vertices, because their density near small lamps has no bound.
-    ``None`` if there are too few vertices. See :func:`suitable_radius`."""
+    ``None`` if there are too few vertices. See :func:`suitable_radius`.
+
+    In dense media, light lies within a mean free path of the surface, and a wide ball would reach
+    out of the medium: the median of the mean free paths limits the radius."""
     least = 2 * footprint or scene_diagonal(scene) / 500
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
@@ -113,4 +121,17 @@ def suitable_ball(
     per_volume = max(others, 1e-6) / (2 * radius) ** 3
     count = PHOTONS_PER_DISK * PILOT_PATHS / pixels
     found = (count / (4 / 3 * math.pi * per_volume)) ** (1 / 3)
-    return min(found, widest_ball(scene, footprint))
+    return min(found, widest_ball(scene, footprint), _FREE_PATHS * _free_path(vertices, kept))
+
+
+def _free_path(vertices: VertexCache, kept: Kept) -> float:
+    """The median of the mean free paths at these vertices; infinite if they do not know their
+    media."""
+    index, active = vertices.every()
+    active &= kept(index, active)
+    vertex = vertices.at(index, active)
+    if vertex.medium is None:
+        return math.inf
+    σ = MediumTerms(True).extinction(vertex.si, vertex.medium)
+    (found,) = to_host(dr.select(active, σ, -1))
+    return 1 / max(float(np.median(found[found >= 0])), 1e-30)

@@ -171,6 +171,19 @@ def test_merging_in_spectral_media_has_the_image_of_volpath(variant: str) -> Non
     assert_same_quarters(found, expected, 0.02)
 
 
+def test_balls_are_small_in_dense_media() -> None:
+    """All light is near the surface, where wide balls are mostly empty."""
+    milk = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "dielectric"},
+            "interior": homogeneous(100.0, 0.95, 0.0)}  # fmt: skip
+    sky = {"type": "constant"}
+    scene = mi.load_dict(fog("area", fog=milk, floor=sky))
+    bdpt, vcm = (
+        np.array(make(name, 16, hide_emitters=True).render(scene, spp=64)).mean()
+        for name in ("bdpt", "vcm")
+    )
+    assert vcm == pytest.approx(bdpt, rel=0.1)
+
+
 def test_light_does_not_leak_through_the_surface_of_glass() -> None:
     """Two fogs, of which only the outer one is lit; a black film lies between them."""
     black = {"type": "mask", "opacity": 1.0, "bsdf": diffuse(0.0)}
