@@ -75,7 +75,7 @@ def auto(
     Begins as path, and measures which techniques are worth their time in this scene: guided
     directions, learned lights, and maps of times, lens points, wavelengths and distances
     (auto_path); light paths, their number, the number of connections to them, and merging with them
-    (vcm); in fog, photons (sppm).
+    (vcm; in participating media, bdpt and sppm).
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at

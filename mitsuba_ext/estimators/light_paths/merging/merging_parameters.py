@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -85,7 +85,8 @@ class MergingParameters:
         seen = footprint if alone else footprint or scene_diagonal(scene) / 1000
         vertices = None
         if self.radius == 0 or (in_media and self.radius_in_media == 0):
-            vertices = pilot_vertices(scene, sensor, light_walk)
+            # With their media, whose mean free paths limit the radius
+            vertices = pilot_vertices(scene, sensor, replace(light_walk, connects=True))
         caustic = vertices.is_caustic if only_caustic and vertices is not None else None
         disk, ball = None, None
         radius, widest = self.radius, math.inf

@@ -177,11 +177,12 @@ def test_balls_are_small_in_dense_media() -> None:
             "interior": homogeneous(100.0, 0.95, 0.0)}  # fmt: skip
     sky = {"type": "constant"}
     scene = mi.load_dict(fog("area", fog=milk, floor=sky))
-    bdpt, vcm = (
+    bdpt, vcm, sppm = (
         np.array(make(name, 16, hide_emitters=True).render(scene, spp=64)).mean()
-        for name in ("bdpt", "vcm")
+        for name in ("bdpt", "vcm", "sppm")
     )
     assert vcm == pytest.approx(bdpt, rel=0.1)
+    assert sppm == pytest.approx(bdpt, rel=0.2)  # it has nothing else near the surface
 
 
 def test_light_does_not_leak_through_the_surface_of_glass() -> None:
