@@ -85,8 +85,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
     is at most two mean free paths), and too bright behind a wall that is thinner than the radius. A
     light is taken to lie in the medium on its side of the closest boundary, in the direction of
     each photon; outside all boundaries, in the medium behind the last boundary that a ray from the
-    sensor crosses. Lights at infinity are refused if that medium is not a vacuum. In camera rays through
-    homogeneous media, ``sample_emitters`` is ignored.
+    sensor crosses. Lights at infinity are refused if that medium is not a vacuum. In camera rays
+    through homogeneous media, ``sample_emitters`` is ignored.
 
     Curves whose BSDF transmits light, such as :monosp:`hair`, are refused, because photons do not
     pass through them (use :class:`vcm`). Gradients are not supported (use :class:`composed_prb`),
