@@ -50,7 +50,7 @@ CASES = {
         RegionProgram(SubpathSelection()), *(RegionHistory(mi.UInt32(8)) for _ in range(2))
     ),
     "hidden lights": lambda: (
-        HiddenLightProgram(), *(HiddenLight(mi.Float(0), mi.Float(3)) for _ in range(2))
+        HiddenLightProgram(), *(HiddenLight(mi.Float(0), mi.Float(0), mi.Float(3)) for _ in range(2))
     ),
 }  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_the_first_word_tells_what_came_from_delta_lobes(name: str) -> None:
     of_delta_lobes = {
         "sums": Sums(mi.Float(0), mi.Float(3)),
         "photons": PhotonHistory(mi.Float(0)),
-        "hidden lights": HiddenLight(mi.Float(0), mi.Float(3)),
+        "hidden lights": HiddenLight(mi.Float(1), mi.Float(0), mi.Float(3)),
     }
     program, *_ = CASES[name]()
     assert program.stored.words(of_delta_lobes[name])[0] == 0
