@@ -50,7 +50,7 @@ CASES = {
         RegionProgram(SubpathSelection()), *(RegionHistory(mi.UInt32(8)) for _ in range(2))
     ),
     "hidden lights": lambda: (
-        HiddenLightProgram(), *(HiddenLight(mi.Float(0), mi.Float(0), mi.Float(3)) for _ in range(2))
+        HiddenLightProgram(), *(HiddenLight(*map(mi.Float, (0, 0, 3))) for _ in range(2))
     ),
 }  # fmt: skip
 
