@@ -119,7 +119,7 @@ def assert_variance_of_path_is_predicted(scene: dict[str, Any], **parameters: An
     """From what all techniques find, and measured between seeds of ``path``."""
     scene = mi.load_dict(scene, optimize=False)
     integrator = _auto(max_depth=4, pilot_spp=64, **parameters)
-    mi.render(scene, integrator=integrator, spp=256)
+    mi.render(scene, integrator=integrator, spp=512)  # an eighth of them are pilots
     predicted = integrator.learners["light_paths"].estimate.variances[0].mean()
     seeds = batches(scene, mi.load_dict({"type": "path", "max_depth": 4}), 16, range(24))
     measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()
