@@ -98,8 +98,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
         trials.append(trial)
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
-    for share in ("_MOST", "_SHARE"):
-        monkeypatch.setattr(light_paths, share, 1.0)
+    monkeypatch.setattr(light_paths, "_MOST", 1.0)
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
