@@ -71,7 +71,7 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     guided, too (:monosp:`flights` of :monosp:`composed_path`), and with it the probability that it
     scatters before the next surface. Both follow the radiance along the ray. What lamps send to the
     fog is computed in a grid of 64 x 64 x 64 voxels; what fog and surfaces scatter is learned. Half
-    of the distances remain those of :monosp:`volpath`. Distances in grids (:monosp:`heterogeneous`)
+    of the distances are drawn as by :monosp:`volpath`. Distances in grids (:monosp:`heterogeneous`)
     are not guided.
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass

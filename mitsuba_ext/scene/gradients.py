@@ -78,8 +78,8 @@ def optimized_but_smooth(scene: mi.Scene) -> list[str]:
 
 
 class RoughBSDFs:
-    """The BSDFs of a scene whose roughness has gradients, that sample visible normals, and most of
-    whose samples do: not those of ``roughplastic`` and others with strong diffuse lobes. BSDFs
+    """The BSDFs of a scene whose roughness has gradients, and that sample visible normals with most
+    of their samples. ``roughplastic`` and other BSDFs with strong diffuse lobes do not. BSDFs
     within instances are not accessible.
 
     Attributes:
@@ -97,7 +97,7 @@ class RoughBSDFs:
 
     @classmethod
     def of(cls, scene: mi.Scene) -> RoughBSDFs | None:
-        """Those of ``scene``; ``None`` if there are none."""
+        """The rough BSDFs of ``scene``; ``None`` if there are none."""
         found = {}
         for shape in scene.shapes():
             bsdf = shape.bsdf()

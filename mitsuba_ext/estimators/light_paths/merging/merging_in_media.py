@@ -125,13 +125,10 @@ def suitable_ball(
 
 
 def _free_path(vertices: VertexCache, kept: Kept) -> float:
-    """The median of the mean free paths at these vertices; infinite if they do not know their
-    media."""
+    """The median of the mean free paths at these vertices, which know their media."""
     index, active = vertices.every()
     active &= kept(index, active)
     vertex = vertices.at(index, active)
-    if vertex.medium is None:
-        return math.inf
     σ = MediumTerms(True).extinction(vertex.si, vertex.medium)
     (found,) = to_host(dr.select(active, σ, -1))
     return 1 / max(float(np.median(found[found >= 0])), 1e-30)
