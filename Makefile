@@ -21,7 +21,7 @@ BIN    := $(VENV)/bin
 DEMO_OUT := out/demo
 DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml scenes/glass_lamp.xml \
         path auto bdpt --size 160x90 --spp 80 --seeds 3 \
-        --reference-integrator bdpt --reference-spp 512 --out $(DEMO_OUT)
+        --reference-integrator bdpt --reference-spp 1024 --out $(DEMO_OUT)
 
 # One process per core (1 GiB of memory each), each with one thread of Dr.Jit. A process that is done
 # takes over tests that others have not begun.
