@@ -1,11 +1,11 @@
-"""The noise of media whose extinction differs between colours, per sample and per second.
+"""The noise of cubes of fog, grey and coloured, per sample and per second.
 
-    python benchmarks/coloured_media.py
+    python benchmarks/fog_cubes.py
 
 Writes a row of Markdown for each scene (a cube of the medium above a floor, 2 units wide): variance
 and CPU time of a sample in units of ``composed_path``. Without the 0.1 % of pixels that vary most;
-in brackets with all of them. ``volpath`` divides by the density of one colour: the more samples it
-takes, the rarer and brighter are the samples that it lacks.
+in brackets with all of them. In coloured media, ``volpath`` divides by the density of one colour:
+the more samples it takes, the rarer and brighter are the samples that it lacks.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 def scenes() -> dict[str, dict[str, Any]]:
     """The scenes, by name."""
     sys.path.insert(0, str(ROOT))
-    from tests.support.fogs import fog, homogeneous
+    from tests.support.fogs import fog, fog_around_the_camera, grid, homogeneous
     from tests.support.stage import rgb
 
     density = np.random.default_rng(3).random((6, 5, 7, 1), dtype=np.float32)
@@ -38,6 +38,11 @@ def scenes() -> dict[str, dict[str, Any]]:
         return {"type": "heterogeneous", "sigma_t": volume, "albedo": rgb(0.9, 0.9, 0.9)}
 
     return {
+        "0.5; a lamp": fog("area", homogeneous(0.5, 0.9)),
+        "0.5; the sky": fog("environment", homogeneous(0.5, 0.9)),
+        "20; a lamp": fog("area", homogeneous(20.0, 0.9)),
+        "0.1, around the camera; a lamp": fog_around_the_camera("area", homogeneous(0.1, 0.9)),
+        "grid, up to 2; a lamp": fog("area", grid(1.0, 0.9)),
         "0.2, 0.5, 0.9; a lamp": fog("area", homogeneous([0.2, 0.5, 0.9], 0.9)),
         "0.1, 1, 10; a lamp": fog("area", homogeneous([0.1, 1.0, 10.0], 0.9)),
         "0.1, 1, 10; the sky": fog("environment", homogeneous([0.1, 1.0, 10.0], 0.9)),
