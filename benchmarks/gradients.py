@@ -8,8 +8,8 @@ or ``prbvolpath`` in scenes with media.
 The loss is the mean of the image, weighted by random numbers / (1 + radiance); with ``--loss
 squared``, by the derivative of a squared error that was measured with 16 samples per pixel; with
 ``--loss masked``, by random numbers in the middle quarter of the image alone. Its gradients are
-those with respect to all colours, roughnesses and emissions of the scene that are no textures, and
-to the albedo and extinction of media;
+those with respect to all colours (except black ones), roughnesses and emissions of the scene that
+are no textures, and to the albedo and extinction of media;
 with ``--roughness``, with respect to roughnesses alone;
 with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
@@ -106,7 +106,11 @@ def main(
     for file in files:
         scene, parameters, weights = load(file, size, loss)
         ends = _ROUGHNESS if roughness else _ENDS
-        keys = [key for key in parameters.keys() if key.endswith(ends)]
+        # Black things have gradients of noise alone
+        keys = [
+            key for key in parameters.keys()
+            if key.endswith(ends) and np.any(np.array(parameters[key]) != 0)
+        ]  # fmt: skip
         sets = [keys]
         if lamps:
             all_lamps = [[key] for key in keys if key.endswith("radiance.value")]

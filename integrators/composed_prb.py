@@ -16,11 +16,13 @@ from mitsuba_ext.rendering.loss_samples import LossSamples
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import (
     RoughBSDFs,
-    optimized_but_smooth,
-    optimizes_grids,
+    doubtful_gradients,
+    has_gaps,
+    optimizes_media,
+    optimizes_mirrors,
     refuse_geometry,
+    without_gradients,
 )
-from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.mirrored_directions import MirroredDirections, PairedNumbers
@@ -53,6 +55,9 @@ class ComposedPRB(common.RBIntegrator):
        - As in :class:`composed_path`, except :monosp:`resampled`, :monosp:`two_stage` and
          :monosp:`triple_product`. (Default: uniform)
      * - roulette
+       - |string|
+       - As in :class:`composed_path`. (Default: automatic)
+     * - flights
        - |string|
        - As in :class:`composed_path`. (Default: automatic)
      * - connections
@@ -99,12 +104,14 @@ class ComposedPRB(common.RBIntegrator):
     media: their albedo, their extinction (:monosp:`sigma_t`; Mitsuba's :monosp:`scale` has no
     derivatives), and parameters of phase functions. **Not when** you optimize the position or shape
     of objects, or the camera (use :monosp:`prb` or :monosp:`prb_projective`): these are refused,
-    and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth glass have no
-    gradients (a warning names them), nor has the opacity of masks where light passes. The same
-    holds for the mirror of a :monosp:`plastic`. (:monosp:`prb` counts its light as light of the
-    diffuse lobe, so that gradients of :monosp:`diffuse_reflectance` are biased.) Gradients of
-    exactly black colours, of an albedo of 0, and of a homogeneous extinction of 0 lack the light
-    that scattered rays would have found.
+    and so are moving shapes and dispersion. Gradients of exactly black colours lack the light that
+    scattered rays would have found. After the first pass for gradients, a warning names parameters
+    that have received none.
+
+    Unlike in :monosp:`prb`, mirrors and smooth glass have gradients, and so has the opacity of
+    masks, except for light that reaches a vertex in a medium through them. (:monosp:`prb` counts
+    light of the mirror of a :monosp:`plastic` as light of its diffuse lobe, so that gradients of
+    :monosp:`diffuse_reflectance` are biased.)
 
     The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
@@ -120,11 +127,12 @@ class ComposedPRB(common.RBIntegrator):
     Gradients of :monosp:`roughplastic`, of BSDFs without :monosp:`sample_visible`, and within
     instances have no pairs.
 
-    In media, the camera may be in fog, and extinctions may be coloured. The extinction of a grid
-    has unbiased gradients where the grid is empty, too: some paths scatter there for derivatives
-    only, which find the light that a little more extinction would scatter. (:monosp:`prbvolpath`
-    finds only the light that it would absorb: in empty regions, its gradient may have the wrong
-    sign.) Grids within instances, which are not accessible, have no such paths.
+    In media, the camera may be in fog, and extinctions may be coloured. Gradients are unbiased
+    where a medium scatters nothing, too: where a grid is empty, and where an extinction or an
+    albedo is 0 (unless the medium has no end). Some paths scatter there for derivatives only, which
+    find the light that a little more would scatter. (:monosp:`prbvolpath` finds only the light that
+    it would absorb: in empty regions, its gradient may have the wrong sign.) Media within
+    instances, which are not accessible, have no such paths.
 
     The first render of a scene takes pilot samples and learns; later renders, and the passes for
     gradients, use what it has learned. :monosp:`forget()` makes the next render learn again. If
@@ -171,7 +179,8 @@ class ComposedPRB(common.RBIntegrator):
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
-        self._pixel_count, self._medium, self._fills_gaps = 1, None, False
+        self._pixel_count, self._medium = 1, None
+        self._flights, self._fills_gaps, self._mirrors = True, False, False
         self._optimized: frozenset[str] = frozenset()
         self._rough: RoughBSDFs | None = None
 
@@ -221,12 +230,14 @@ class ComposedPRB(common.RBIntegrator):
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         sensor = find_sensor(scene, sensor)
         with in_turn(self, sensor):
-            self._learn_for(scene, params, sensor, seed, spp)
+            is_new = self._learn_for(scene, params, sensor, seed, spp)
             if self._follows_loss:
                 with dr.suspend_grad():
                     self._follow_loss(scene, grad_in, sensor, seed, spp)
             else:
                 super().render_backward(scene, params, grad_in, sensor, seed, spp)
+            if is_new:
+                self._tell_of_zeros(params, grad_in)
 
     def _follow_loss(self, scene, grad_in, sensor, seed, spp) -> None:
         sampler, spp = self.prepare(sensor, seed, spp)
@@ -241,26 +252,42 @@ class ComposedPRB(common.RBIntegrator):
         )  # fmt: skip
         dr.eval()
 
-    def _learn_for(self, scene, params, sensor, seed, spp) -> None:
+    def _learn_for(self, scene, params, sensor, seed, spp) -> bool:
+        """Prepares a pass for gradients. Returns whether it is the first one with respect to these
+        parameters."""
         refuse_geometry(self.name, params)
-        self._tell_of_zeros(scene, params)
+        is_new = self._tell_of_doubts(scene, params)
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
-        self._fills_gaps = optimizes_grids(scene)
+        self._flights = optimizes_media(scene)
+        self._fills_gaps = has_gaps(scene)
+        self._mirrors = optimizes_mirrors(scene)
         self._rough = RoughBSDFs.of(scene)
+        return is_new
 
-    def _tell_of_zeros(self, scene, params) -> None:
-        """Warns of gradients that are always 0, once for each set of parameters."""
+    def _tell_of_doubts(self, scene, params) -> bool:
+        """Warns of gradients that are not those of the image, once for each set of parameters.
+        Returns whether the set is new."""
         items = params.items() if hasattr(params, "items") else ()
         optimized = frozenset(str(key) for key, value in items if dr.grad_enabled(value))
         if optimized == self._optimized:
-            return
+            return False
         self._optimized = optimized
-        if smooth := optimized_but_smooth(scene):
+        for sentence in doubtful_gradients(scene):
+            mi.Log(mi.LogLevel.Warn, f'"{self.name}": {sentence}.')
+        return True
+
+    def _tell_of_zeros(self, params, grad_in) -> None:
+        """Warns of parameters that have not received a gradient, although the loss depends on the
+        image."""
+        zeros = without_gradients(params)
+        if zeros and dr.any(dr.ravel(grad_in) != 0):
             mi.Log(
                 mi.LogLevel.Warn,
-                f'"{self.name}": mirrors and smooth glass have no gradients: they are 0 for the '
-                f"BSDFs {', '.join(smooth)}. Rough BSDFs have some.",
+                f'"{self.name}": no sample of this pass has a gradient with respect to '
+                f"{', '.join(zeros)}. Things that are not seen have none, nor have lobes whose "
+                f"weight is 0: begin above 0. Mitsuba may have to be told of a parameter: after "
+                f"dr.enable_grad(), assign it (params[key] = …) and call params.update().",
             )
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
@@ -283,13 +310,16 @@ class ComposedPRB(common.RBIntegrator):
             directions = MirroredDirections(walk.directions, self._rough)
             walk = replace(walk, directions=directions)
         if mode == dr.ADMode.Primal:
-            first = FirstPass(self._fills_gaps) if may_have_media(scene) else None
+            first = FirstPass(self._fills_gaps) if self._flights else None
             sample = replace(walk, replay=first)(scene, sampler, rays, mi.Bool(active))
             gathered = (sample.L, None)
             if first is not None:
                 gathered = (first.L, first.detour_L if self._fills_gaps else None)
             return sample.L, sample.valid, [], gathered
-        replay = Replay(scene, state_in[0], δL if mode == dr.ADMode.Backward else None, state_in[1])
+        replay = Replay(
+            scene, state_in[0], δL if mode == dr.ADMode.Backward else None, self._flights,
+            state_in[1], self._mirrors,
+        )  # fmt: skip
         sample = replace(walk, replay=replay)(scene, sampler, rays, mi.Bool(active))
         L = sample.L if mode == dr.ADMode.Backward else replay.derivative
         return L, sample.valid, [], None

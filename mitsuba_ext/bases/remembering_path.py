@@ -25,7 +25,7 @@ from .slots import SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
 
 #: The decisions that a scene can replace: those that do not change camera rays.
-_SLOTS = ("directions", "next_event", "roulette", "connections", "mis", "shadow_test")
+_SLOTS = ("directions", "next_event", "roulette", "flights", "connections", "mis", "shadow_test")
 
 #: Decisions whose weights are not radiance / density.
 _NOT_DETACHED = {"next_event": ("resampled_lights", "two_stage_lights"), "directions": ("swarm",)}

@@ -24,7 +24,7 @@ def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     """Which BSDFs of ``scene`` are, or contain, one of the ``classes``: a table over Dr.Jit's
     indices of BSDFs. ``None`` if no BSDF does. The BSDFs of an instance are not accessible: if the
     scene has an instance, all BSDFs in memory are examined."""
-    found = [_index(bsdf) for bsdf in _bsdfs(scene) if contains_bsdf(bsdf, classes)]
+    found = [_index(bsdf) for bsdf in all_bsdfs(scene) if contains_bsdf(bsdf, classes)]
     if not found:
         return None
     table = np.zeros(max(found) + 1, bool)
@@ -57,13 +57,13 @@ def opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
 def has_glossy_lobes(scene: mi.Scene) -> bool:
     """Whether a BSDF of the scene has glossy lobes."""
     glossy = int(mi.BSDFFlags.Glossy)
-    return any(int(bsdf.flags()) & glossy for bsdf in _bsdfs(scene))
+    return any(int(bsdf.flags()) & glossy for bsdf in all_bsdfs(scene))
 
 
 def mixes_lobes(scene: mi.Scene) -> bool:
     """Whether a BSDF of the scene has both diffuse and glossy lobes."""
     diffuse, glossy = int(mi.BSDFFlags.Diffuse), int(mi.BSDFFlags.Glossy)
-    flags = [int(bsdf.flags()) for bsdf in _bsdfs(scene)]
+    flags = [int(bsdf.flags()) for bsdf in all_bsdfs(scene)]
     return any(f & diffuse and f & glossy for f in flags)
 
 
@@ -71,7 +71,8 @@ def undivided_bsdfs(scene: mi.Scene) -> mi.Float | None:
     """For BSDFs that are, or contain, a ``principled`` or ``principledthin``: the weight of its
     diffuse lobes (the mean over a texture). It is a table over Dr.Jit's indices of BSDFs, negative
     for other BSDFs; ``None`` if there are only others."""
-    weights = {_index(b): diffuse_weight(b) for b in _bsdfs(scene) if contains_bsdf(b, _UNDIVIDED)}
+    found = (bsdf for bsdf in all_bsdfs(scene) if contains_bsdf(bsdf, _UNDIVIDED))
+    weights = {_index(bsdf): diffuse_weight(bsdf) for bsdf in found}
     if not weights:
         return None
     table = np.full(max(weights) + 1, -1.0)
@@ -126,7 +127,7 @@ def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
         )
 
 
-def _bsdfs(scene: mi.Scene) -> set[mi.BSDF]:
+def all_bsdfs(scene: mi.Scene) -> set[mi.BSDF]:
     """The BSDFs of a scene; with an instance, whose BSDFs are not accessible, all in memory."""
     shapes = all_shapes(scene.shapes())
     bsdfs = {shape.bsdf() for shape in shapes if shape.bsdf() is not None}

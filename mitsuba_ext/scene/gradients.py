@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .bsdfs import diffuse_weight
-from .media import scene_media
+from .bsdfs import all_bsdfs, contains_bsdf, diffuse_weight
+from .media import has_instances, may_have_media, scene_media
 from .parameter_values import values_of
 
 #: Parameters of shapes and sensors that change where rays hit.
@@ -48,33 +48,90 @@ def refuse_geometry(plugin: str, params: Any) -> None:
             )
 
 
+def without_gradients(params: Any) -> list[str]:
+    """The names of the parameters that should have received a gradient, but have not. None while a
+    user records a whole step (``dr.freeze``), when no array can be read."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return []
+    return sorted(
+        str(key)
+        for key, value in (params.items() if hasattr(params, "items") else ())
+        if dr.grad_enabled(value) and not np.any(np.array(dr.grad(value)) != 0)
+    )
+
+
 def has_gradients(*things: mi.Object) -> bool:
     """Whether any parameter of a scene or a sensor has a gradient."""
     return any(dr.grad_enabled(value) for each in things for _, value in mi.traverse(each))
 
 
-def optimizes_grids(scene: mi.Scene) -> bool:
-    """Whether the extinction of a medium that is not homogeneous has a gradient. Media within
-    instances are not accessible."""
+def has_gaps(scene: mi.Scene) -> bool:
+    """Whether a medium is optimized that may scatter nothing somewhere: it has the extinction of a
+    grid, or an albedo or an extinction of 0 (which cannot be found out while a user records a whole
+    step). Media within instances are not accessible."""
+    can_read = not dr.flag(dr.JitFlag.FreezingScope)
     return any(
-        key.startswith("sigma_t") and dr.grad_enabled(value)
+        key.startswith(("sigma_t", "albedo")) and dr.grad_enabled(value)
+        and (_is_grid(medium, key) or (can_read and np.any(np.array(value) == 0)))
         for medium in scene_media(scene)
-        if not medium.is_homogeneous()
         for key, value in values_of(mi.traverse(medium))
-    )
+    )  # fmt: skip
 
 
-def optimized_but_smooth(scene: mi.Scene) -> list[str]:
-    """The names of the BSDFs whose parameters have gradients, although all of their light is
-    reflected or refracted as by mirrors and smooth glass. Their gradients are 0."""
-    bsdfs = {bsdf.ptr: bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
-    return sorted(
-        bsdf.id()
-        for bsdf in bsdfs.values()
-        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-        and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        and _is_optimized(bsdf)
-    )
+def _is_grid(medium: mi.Medium, key: str) -> bool:
+    return key.startswith("sigma_t") and not medium.is_homogeneous()
+
+
+def optimizes_media(scene: mi.Scene) -> bool:
+    """Whether a medium may have a parameter with gradients."""
+    # Media within instances are not accessible
+    is_hidden = has_instances(scene) and may_have_media(scene)
+    return is_hidden or any(_is_optimized(medium) for medium in scene_media(scene))
+
+
+def optimizes_mirrors(scene: mi.Scene) -> bool:
+    """Whether a BSDF that reflects or transmits light as mirrors, smooth glass and masks do, or a
+    part of whose light they do, has parameters with gradients."""
+    return any(_has_mirror(bsdf) and _is_optimized(bsdf) for bsdf in all_bsdfs(scene))
+
+
+def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
+    """Sentences on BSDFs whose gradients are not, or not all, those of the image."""
+    blends, masks, leaves = [], [], []
+    for bsdf in all_bsdfs(scene):
+        if not _has_mirror(bsdf) or not _is_optimized(bsdf):
+            continue
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and contains_bsdf(bsdf, ("BlendBSDF",)):
+            blends.append(bsdf.id())
+        if contains_bsdf(bsdf, ("MaskBSDF",)) and _is_optimized(bsdf, "opacity"):
+            (masks if _is_mirror(bsdf) else leaves).append(bsdf.id())
+    if blends:
+        yield (
+            f"a blendbsdf that contains a mirror has the wrong brightness in Mitsuba, and its "
+            f"gradients differ from its image: {_listed(blends)}. Blend rough BSDFs instead"
+        )
+    if masks:
+        yield f"gradients of the opacity of a mask around a mirror are wrong: {_listed(masks)}"
+    if leaves and may_have_media(scene):
+        yield (
+            f"in scenes with media, the gradients of the opacity of masks lack the light that "
+            f"reaches a vertex through them: {_listed(leaves)}"
+        )
+
+
+def _has_mirror(bsdf: mi.BSDF) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+
+
+def _is_mirror(bsdf: mi.BSDF) -> bool:
+    """Like :func:`_has_mirror`, but false for masks of what is none."""
+    flags = bsdf.flags()
+    kinds = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
+    return any(mi.has_flag(flags, kind) for kind in kinds)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
 
 
 class RoughBSDFs:
@@ -172,8 +229,13 @@ class Optimized:
         return _gathered(self._emitters, emitter)
 
 
-def _is_optimized(thing: Any) -> bool:
-    return any(dr.grad_enabled(value) for _key, value in values_of(mi.traverse(thing)))
+def _is_optimized(thing: Any, name: str = "") -> bool:
+    """Whether it has a parameter (of this ``name``) with gradients."""
+    return any(
+        dr.grad_enabled(value)
+        for key, value in values_of(mi.traverse(thing))
+        if not name or name in key.split(".")
+    )
 
 
 def _has_optimized_colours(shape: mi.Shape) -> bool:

@@ -148,10 +148,10 @@ class Connector:
         weight, tested, state = self._roulette(state, connection, survival_sample, si, tested)
         value *= weight
         if self._media.exist:
+            finds_way = self._replay is not None and self._replay.flights
             T, known, way = self._media.transmittance(
-                self._query, self._scene, vertex, ds, inside, self._replay is not None, sampler,
-                tested,
-            )  # fmt: skip
+                self._query, self._scene, vertex, ds, inside, finds_way, sampler, tested
+            )
             if self._program.weighs_transmittance:
                 # What finds the light otherwise flies all the way, with this probability
                 value *= self._mis(vertex, ds, count * ds.pdf / for_weights(known), pdf)

@@ -1,15 +1,17 @@
-"""In-scattered light where a medium is empty, for derivatives with respect to its extinction.
+"""In-scattered light where a medium scatters nothing, for derivatives with respect to its albedo and
+extinction.
 
 Where σ_t = 0, no path scatters, but a little more extinction would scatter light there. The
 derivative of the radiance along a ray has a term ∫ T(t) σ_s'(t) L_s(t) dt, where L_s is the
-in-scattered radiance. Paths that scatter in proportion to σ_t never see L_s in empty
-regions, and rarely in thin ones. So some of the paths in media of varying density take a *detour*:
-instead of flying on, they scatter at a uniform point, with the transmittance up to there. What such
-a path gathers behind that point is L_s. It is not part of the path's radiance.
+in-scattered radiance. Paths that scatter in proportion to σ_t never see L_s in empty regions, and
+rarely in thin ones; paths that scatter in a black medium carry no light. So in media of varying
+density, and in homogeneous media that do not scatter light of some colour, some of the paths take a
+*detour*: instead of flying on, they scatter at a uniform point, with the transmittance up to there.
+What such a path gathers behind that point is L_s. It is not part of the path's radiance.
 
 Points at which a path scatters and points of detours are weighed with the balance heuristic. The
 density of the former is σ_t, of the latter ``rate``, both relative to the probability of a flight
-that far.
+that far. Detours alone find the light of a colour that is not scattered.
 
 Source: M. Nimier-David, T. Müller, A. Keller, W. Jakob, *Unbiased Inverse Volume Rendering with
 Differential Trackers*, ACM Transactions on Graphics 41(4), 2022, section 4 (which samples points in
@@ -23,7 +25,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .free_flight import interaction_at
+from .free_flight import attenuation, interaction_at
 from .media import vertex_at
 from .transmittance import ratio_tracking, stretch
 from .vertex import FlightEnd
@@ -34,7 +36,7 @@ class Detour:
     """The state of a path.
 
     Attributes:
-        flights: The number of flights in media of varying density.
+        flights: The number of flights that might have become detours.
         taken: Whether the path has taken its detour.
         L: The radiance that it had gathered before.
     """
@@ -96,14 +98,18 @@ def detour_point(
     Returns:
         The point, and the new state, except for the radiance.
     """
-    flies = active & (medium != None) & ~medium.is_homogeneous()  # noqa: E711
+    flies = active & (medium != None)  # noqa: E711
+    is_homogeneous = medium.is_homogeneous()
+    σ_s, _, σ = medium.get_scattering_coefficients(interaction_at(ray, ray.o, medium), flies)
+    flies &= ~is_homogeneous | (dr.min(mi.Spectrum(σ_s)) == 0)
     start, length = stretch(medium, ray, end, flies)
     flies &= (length > 0) & ~detour.taken
     # After n flights, 3 / (n + 3) of the paths are left
     probability = dr.rcp(mi.Float(detour.flights + 4))
     chosen = flies & (sampler.next_1d(flies) < probability)
     t = start + sampler.next_1d(chosen) * length
-    T = ratio_tracking(ray, t, medium, channel, sampler, mi.Spectrum(1), chosen)
+    T = dr.select(is_homogeneous, attenuation(mi.Spectrum(σ), t), 1)
+    T = ratio_tracking(ray, t, medium, channel, sampler, T, chosen & ~is_homogeneous)
     point = DetourPoint(
         chosen=chosen,
         mei=interaction_at(ray, ray(t), medium),

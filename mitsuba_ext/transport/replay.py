@@ -22,9 +22,12 @@ class FirstPass:
         detours: Whether paths take detours (``detours.py``).
 
     Attributes:
+        flights: Whether flights through media have derivatives.
         L: The radiance that each path has gathered, once they have ended.
         detour_L: What they have gathered behind their detours.
     """
+
+    flights = True
 
     def __init__(self, detours: bool = False) -> None:
         self._detours = detours
@@ -87,10 +90,11 @@ class FirstPass:
         ``way`` is the way of the light through media; ``None`` if the scene has none."""
 
     def scattered(
-        self, vertex: Vertex, bs: mi.BSDFSample3f, L: mi.Spectrum, active: mi.Bool
-    ) -> None:
-        """The path continues from ``vertex`` in the direction ``bs``. It has gathered ``L`` so
-        far."""
+        self, vertex: Vertex, bs: mi.BSDFSample3f, sample_1: mi.Float, sample_2: mi.Point2f,
+        L: mi.Spectrum, active: mi.Bool,
+    ) -> None:  # fmt: skip
+        """The path continues from ``vertex`` in the direction ``bs``, which ``sample_1`` and
+        ``sample_2`` have chosen. It has gathered ``L`` so far."""
 
 
 class Replay(FirstPass):
@@ -103,25 +107,31 @@ class Replay(FirstPass):
     collisions: it is the length of the way times the derivative of σ_t at one uniform point of it
     (everywhere the same in homogeneous media).
 
+    What a mirror or smooth glass sends into a direction has no density. Its value is the weight of
+    the sample times the probability of the lobe.
+
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation*, ACM Transactions on
     Graphics 40(4), 2021, section 4.
 
     Parameters:
         scene: The scene.
         L: The radiance that each path gathers.
-        detour_L: What it gathers behind its detour; ``None`` if there are none.
         δL: Backward: the derivative of the loss with respect to this radiance. ``None`` for forward
             mode.
+        flights: Whether media have parameters with gradients.
+        detour_L: What it gathers behind its detour; ``None`` if there are none.
+        mirrors: Whether mirrors or smooth glass are optimized.
 
     Attributes:
         derivative: Forward: the derivative of the radiance of each path, once they have ended.
     """
 
     def __init__(
-        self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None,
-        detour_L: mi.Spectrum | None = None,
+        self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None, flights: bool = True,
+        detour_L: mi.Spectrum | None = None, mirrors: bool = False,
     ) -> None:  # fmt: skip
         super().__init__(detour_L is not None)
+        self.flights, self._mirrors = flights, mirrors
         self._scene, self._L, self._δL, self._detour_L = scene, L, δL, detour_L
         if δL is None:
             self._lane = dr.arange(mi.UInt32, dr.width(L))
@@ -142,6 +152,7 @@ class Replay(FirstPass):
             with dr.resume_grad():
                 σ_s, σ_t = _coefficients(point.mei, point.chosen)
                 share = point.rate / (dr.detach(σ_t) + point.rate)
+                share = dr.select(dr.detach(σ_s) > 0, share, 1)
                 self._propagate(dr.select(point.chosen, self._detour_L * share * σ_s, 0))
         with dr.resume_grad():
             σ_s, σ_t = _coefficients(mei, scatters)
@@ -169,16 +180,24 @@ class Replay(FirstPass):
                 gained *= _attenuation(way)
             self._propagate(dr.select(visible, gained, 0))
 
-    def scattered(self, vertex, bs, L, active):
+    def scattered(self, vertex, bs, sample_1, sample_2, L, active):
         wo, later = bs.wo, self._L - L
-        # What a mirror reflects has no gradients, nor is it light of another lobe of the BSDF
-        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        is_delta = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         if vertex.medium is not None:
             is_delta &= ~vertex.medium.scatters
+        # What a mirror reflects is not light of another lobe of the BSDF
         active = active & ~is_delta
         with dr.resume_grad():
             bsdf = self._bsdf(vertex, vertex.si.to_world(wo), wo, active)
             self._propagate(dr.select(active, later * dr.relative_grad(bsdf), 0))
+            if self._mirrors:
+                again, weight = vertex.bsdf.sample(
+                    mi.BSDFContext(), vertex.si, sample_1, sample_2, is_delta
+                )
+                is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+                passing = vertex.bsdf.eval_null_transmission(vertex.si, is_delta & is_null)
+                value = dr.select(is_null, passing, weight * again.pdf)
+                self._propagate(dr.select(is_delta, later * dr.relative_grad(value), 0))
 
     def _bsdf(self, vertex: Vertex, d: mi.Vector3f, wo: mi.Vector3f, active: mi.Bool):
         """The value of the BSDF, or of the phase function, for the direction ``d`` (in world space)

@@ -139,7 +139,7 @@ class Walk:
         # In media, transmittance uses random numbers; `volpath` draws them before the BSDF's
         makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
         has_subpaths = self.program.subpaths is not None
-        replays_media = self.replay is not None and media.exist
+        replays_media = self.replay is not None and self.replay.flights and media.exist
 
         # --------------------- Configure the loop state ----------------------
         pixel = rays.pixel
@@ -274,7 +274,7 @@ class Walk:
             self.observer.direction(vertex, sample_2, directions_weight, L, turns)
             self.observer.scattering(vertex, bs, active)
             if dr.hint(self.replay is not None, mode="scalar"):
-                self.replay.scattered(vertex, bs, L, turns)
+                self.replay.scattered(vertex, bs, sample_1, sample_2, L, turns)
 
             if dr.hint(self.clamps, mode="scalar"):
                 direct = dr.select(path.depth == 0, L, direct)

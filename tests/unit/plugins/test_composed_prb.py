@@ -146,21 +146,79 @@ def test_crop_windows_batches_and_moments_have_gradients(camera: Any, moment: bo
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
 
 
-def test_a_warning_names_the_mirrors_that_are_optimized(capfd) -> None:
-    mirror = {"type": "conductor", "specular_reflectance": rgb(0.9), "id": "looking-glass"}
-    ball = {"type": "sphere", "radius": 0.4, "bsdf": mirror}
-    scene = mi.load_dict(stage(ball=ball), optimize=False)
-    parameters = mi.traverse(scene)
-    integrator = make()
-    for end, count in (("floor.bsdf.reflectance.value", 0), ("specular_reflectance.value", 1)):
-        key = next(key for key in parameters.keys() if key.endswith(end))
-        dr.enable_grad(parameters[key])
+def _floor_of(bsdf: dict[str, Any]) -> mi.Scene:
+    """Seen from above, below a bright and a dark half of the sky, and above a white wall."""
+    T = mi.ScalarTransform4f
+    sky = mi.Bitmap(np.linspace(0.2, 2, 24, dtype=np.float32).reshape(2, 4, 3))
+    return mi.load_dict(
+        stage(floor=rectangle(T().scale(2), bsdf=bsdf), sky={"type": "envmap", "bitmap": sky},
+              wall=rectangle(T().translate([0, 0, -1]).scale(3), bsdf=diffuse(0.9))),
+        optimize=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "bsdf, end",
+    [
+        ({"type": "conductor", "material": "Cu"}, "eta.value"),
+        ({"type": "plastic", "specular_reflectance": 0.8}, "specular_reflectance.value"),
+        ({"type": "dielectric", "specular_transmittance": 0.7}, "specular_transmittance.value"),
+        ({"type": "mask", "opacity": 0.4, "bsdf": {"type": "diffuse"}}, "opacity.value"),
+        ({"type": "blendbsdf", "weight": 0.4, "a": {"type": "conductor", "material": "Au"},
+          "b": {"type": "thindielectric"}}, "weight.value"),
+    ],
+    ids=lambda x: x["type"] if isinstance(x, dict) else "",
+)  # fmt: skip
+def test_mirrors_smooth_glass_and_masks_have_gradients(bsdf: dict[str, Any], end: str) -> None:
+    """``prb`` has none."""
+    scene = _floor_of(bsdf)
+    parameters = small(scene)
+    (key,) = (k for k in parameters.keys() if k.startswith("floor.bsdf") and k.endswith(end))
+    found = backward(scene, parameters, [key], make(max_depth=4), 3, 256)[0].sum()
+    assert found == pytest.approx(difference(scene, parameters, key), rel=0.12)
+
+
+def difference(scene: mi.Scene, parameters: mi.SceneParameters, key: str) -> float:
+    """The derivative of the same loss by finite differences."""
+    start, h, losses = type(parameters[key])(parameters[key]), 0.05, []
+    for step in (h, -h):
+        parameters[key] = start + step
         parameters.update()
-        for seed in range(2):
-            image = mi.render(scene, parameters, integrator=integrator, seed=seed, spp=1)
-            dr.backward(dr.mean(image))
-        said = capfd.readouterr()
-        assert (said.out + said.err).count("0 for the BSDFs looking-glass") == count
+        image = mi.render(scene, integrator=make("composed_path", max_depth=4), seed=4, spp=512)
+        losses.append(float(dr.mean(image * loss_weights(), axis=None).array[0]))
+    parameters[key] = start
+    parameters.update()
+    return (losses[0] - losses[1]) / (2 * h)
+
+
+def _said_after_a_step(capfd, bsdf: dict[str, Any], end: str, assigns: bool) -> str:
+    scene = mi.load_dict(stage(floor=rectangle(bsdf=bsdf)), optimize=False)
+    parameters, integrator = mi.traverse(scene), make()
+    key = next(key for key in parameters.keys() if key.endswith(end))
+    dr.enable_grad(parameters[key])
+    if assigns:
+        parameters[key] = parameters[key]
+        parameters.set_dirty(key)
+        parameters.update()
+    capfd.readouterr()
+    for seed in range(2):
+        image = mi.render(scene, parameters, integrator=integrator, seed=seed, spp=4)
+        dr.backward(dr.mean(image))
+    said = capfd.readouterr()
+    return said.out + said.err
+
+
+@pytest.mark.parametrize("assigns", [False, True])
+def test_a_warning_names_parameters_without_gradients_once(capfd, assigns: bool) -> None:
+    """Mitsuba's ``principled`` computes its refractive index when ``specular`` is updated."""
+    said = _said_after_a_step(capfd, {"type": "principled"}, "specular", assigns)
+    assert said.count("no sample") == said.count("floor.bsdf.specular") == (not assigns)
+
+
+def test_a_warning_names_blends_with_a_mirror(capfd) -> None:
+    blend = {"type": "blendbsdf", "id": "rust", "a": {"type": "diffuse"}, "weight": 0.4,
+             "b": {"type": "conductor"}}  # fmt: skip
+    assert _said_after_a_step(capfd, blend, "weight.value", True).count("image: rust") == 1
 
 
 LEARNED = (
