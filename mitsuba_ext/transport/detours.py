@@ -1,5 +1,5 @@
-"""In-scattered light where a medium scatters nothing, for derivatives with respect to its albedo and
-extinction.
+"""In-scattered light where a medium scatters nothing, for derivatives with respect to its albedo
+and extinction.
 
 Where σ_t = 0, no path scatters, but a little more extinction would scatter light there. The
 derivative of the radiance along a ray has a term ∫ T(t) σ_s'(t) L_s(t) dt, where L_s is the

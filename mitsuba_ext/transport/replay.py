@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .bsdfs import eval_bsdf
+from .bsdfs import eval_bsdf, sample_bsdf
 from .detours import Detour, DetourPoint, detour_point
 from .free_flight import interaction_at
 from .media import Inside, eval_phase
@@ -191,8 +191,8 @@ class Replay(FirstPass):
             bsdf = self._bsdf(vertex, vertex.si.to_world(wo), wo, active)
             self._propagate(dr.select(active, later * dr.relative_grad(bsdf), 0))
             if self._mirrors:
-                again, weight = vertex.bsdf.sample(
-                    mi.BSDFContext(), vertex.si, sample_1, sample_2, is_delta
+                again, weight = sample_bsdf(
+                    vertex.bsdf, mi.BSDFContext(), vertex.si, sample_1, sample_2, is_delta
                 )
                 is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
                 passing = vertex.bsdf.eval_null_transmission(vertex.si, is_delta & is_null)
