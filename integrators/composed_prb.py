@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -309,16 +310,17 @@ class ComposedPRB(common.RBIntegrator):
         if self._rough is not None:
             directions = MirroredDirections(walk.directions, self._rough)
             walk = replace(walk, directions=directions)
+        closest = partial(walk.query.closest, scene, coherent=False) if self._fills_gaps else None
         if mode == dr.ADMode.Primal:
-            first = FirstPass(self._fills_gaps) if self._flights else None
+            first = FirstPass(closest) if self._flights else None
             sample = replace(walk, replay=first)(scene, sampler, rays, mi.Bool(active))
             gathered = (sample.L, None)
             if first is not None:
-                gathered = (first.L, first.detour_L if self._fills_gaps else None)
+                gathered = (first.L, first.detour_L)
             return sample.L, sample.valid, [], gathered
         replay = Replay(
             scene, state_in[0], δL if mode == dr.ADMode.Backward else None, self._flights,
-            state_in[1], self._mirrors,
+            self._mirrors, state_in[1], closest,
         )  # fmt: skip
         sample = replace(walk, replay=replay)(scene, sampler, rays, mi.Bool(active))
         L = sample.L if mode == dr.ADMode.Backward else replay.derivative

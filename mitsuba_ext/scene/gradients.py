@@ -92,7 +92,9 @@ def optimizes_media(scene: mi.Scene) -> bool:
 def optimizes_mirrors(scene: mi.Scene) -> bool:
     """Whether a BSDF that reflects or transmits light as mirrors, smooth glass and masks do, or a
     part of whose light they do, has parameters with gradients."""
-    return any(_has_mirror(bsdf) and _is_optimized(bsdf) for bsdf in all_bsdfs(scene))
+    coloured = [shape.bsdf() for shape in scene.shapes() if _has_optimized_colours(shape)]
+    optimized = coloured + [bsdf for bsdf in all_bsdfs(scene) if _is_optimized(bsdf)]
+    return any(bsdf is not None and _has_mirror(bsdf) for bsdf in optimized)
 
 
 def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
@@ -101,7 +103,8 @@ def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
     for bsdf in all_bsdfs(scene):
         if not _has_mirror(bsdf) or not _is_optimized(bsdf):
             continue
-        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and contains_bsdf(bsdf, ("BlendBSDF",)):
+        is_mixed = _is_mirror(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        if is_mixed and contains_bsdf(bsdf, ("BlendBSDF",)):
             blends.append(bsdf.id())
         if contains_bsdf(bsdf, ("MaskBSDF",)) and _is_optimized(bsdf, "opacity"):
             (masks if _is_mirror(bsdf) else leaves).append(bsdf.id())

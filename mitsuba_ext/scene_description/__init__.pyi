@@ -304,6 +304,7 @@ def composed_prb(
     directions: str | Plugin = "uniform",
     next_event: str | Plugin = "uniform",
     roulette: str = "automatic",
+    flights: str = "automatic",
     connections: str | int | Plugin = "one",
     mis: str | Plugin = "power",
     shadow_test: str | Plugin = "always",
@@ -329,6 +330,7 @@ def composed_prb(
         next_event (string or decision): As in composed_path, except resampled, two_stage and
             triple_product. (Default: uniform)
         roulette (string): As in composed_path. (Default: automatic)
+        flights (string): As in composed_path. (Default: automatic)
         connections (string, int or decision): As in composed_path. (Default: one)
         mis (string or decision): As in composed_path. (Default: power)
         shadow_test (string or decision): As in composed_path. (Default: always)

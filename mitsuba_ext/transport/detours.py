@@ -20,7 +20,9 @@ proportion to the transmittance).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +31,9 @@ from .free_flight import attenuation, interaction_at
 from .media import vertex_at
 from .transmittance import ratio_tracking, stretch
 from .vertex import FlightEnd
+
+#: Returns the first surface that a ray meets (``mi.PreliminaryIntersection3f``), where ``active``.
+Closest = Callable[..., Any]
 
 
 @dataclass
@@ -80,6 +85,7 @@ class DetourPoint:
 
 
 def detour_point(
+    closest: Closest,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     end: mi.Float,
@@ -91,6 +97,7 @@ def detour_point(
     """Chooses the flights that become detours, and their points.
 
     Parameters:
+        closest: Finds the surface behind the point where a homogeneous medium has ended a ray.
         ray, end: The ray, and the distance of the surface that it hits.
         medium, channel: The medium, and the colour that chooses distances.
         detour: The state before the flight.
@@ -100,8 +107,13 @@ def detour_point(
     """
     flies = active & (medium != None)  # noqa: E711
     is_homogeneous = medium.is_homogeneous()
-    σ_s, _, σ = medium.get_scattering_coefficients(interaction_at(ray, ray.o, medium), flies)
+    mei = interaction_at(ray, ray.o, medium)
+    σ_s, _, σ = medium.get_scattering_coefficients(mei, flies & is_homogeneous)
     flies &= ~is_homogeneous | (dr.min(mi.Spectrum(σ_s)) == 0)
+    ends_early = flies & is_homogeneous & ~dr.isfinite(end) & (dr.max(mi.Spectrum(σ)) > 0)
+    whole = mi.Ray3f(ray)
+    whole.maxt = dr.largest(mi.Float)
+    end = dr.select(ends_early, closest(whole, active=ends_early).t, end)
     start, length = stretch(medium, ray, end, flies)
     flies &= (length > 0) & ~detour.taken
     # After n flights, 3 / (n + 3) of the paths are left

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .bsdfs import eval_bsdf, sample_bsdf
-from .detours import Detour, DetourPoint, detour_point
+from .detours import Closest, Detour, DetourPoint, detour_point
 from .free_flight import interaction_at
 from .media import Inside, eval_phase
 from .transmittance import Way, stretch
@@ -19,7 +19,7 @@ class FirstPass:
     random numbers as in the second (:class:`Replay`).
 
     Parameters:
-        detours: Whether paths take detours (``detours.py``).
+        closest: Finds surfaces, if paths take detours (``detours.py``); otherwise ``None``.
 
     Attributes:
         flights: Whether flights through media have derivatives.
@@ -29,13 +29,13 @@ class FirstPass:
 
     flights = True
 
-    def __init__(self, detours: bool = False) -> None:
-        self._detours = detours
+    def __init__(self, closest: Closest | None = None) -> None:
+        self._closest = closest
         self.L, self.detour_L = mi.Spectrum(0), mi.Spectrum(0)
 
     def begin(self) -> Detour | None:
         """The state before the first flight."""
-        if not self._detours:
+        if self._closest is None:
             return None
         return Detour(mi.UInt32(0), mi.Bool(False), mi.Spectrum(0))
 
@@ -62,8 +62,9 @@ class FirstPass:
         point, u = None, sampler.next_1d(active)
         if detour is not None:
             point, detour = detour_point(
-                sampler, ray, start.si.t, inside.medium, inside.channel, detour, active
-            )
+                self._closest, sampler, ray, start.si.t, inside.medium, inside.channel, detour,
+                active,
+            )  # fmt: skip
             detour.L = dr.select(point.chosen, L, detour.L)
         active = self._flown(ray, inside.medium, u, end, point, L, active)
         return end if point is None else point.end(start, end), detour, active
@@ -119,8 +120,9 @@ class Replay(FirstPass):
         δL: Backward: the derivative of the loss with respect to this radiance. ``None`` for forward
             mode.
         flights: Whether media have parameters with gradients.
-        detour_L: What it gathers behind its detour; ``None`` if there are none.
         mirrors: Whether mirrors or smooth glass are optimized.
+        detour_L: What it gathers behind its detour; ``None`` if there are none.
+        closest: As in the first pass.
 
     Attributes:
         derivative: Forward: the derivative of the radiance of each path, once they have ended.
@@ -128,9 +130,10 @@ class Replay(FirstPass):
 
     def __init__(
         self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None, flights: bool = True,
-        detour_L: mi.Spectrum | None = None, mirrors: bool = False,
+        mirrors: bool = False, detour_L: mi.Spectrum | None = None,
+        closest: Closest | None = None,
     ) -> None:  # fmt: skip
-        super().__init__(detour_L is not None)
+        super().__init__(closest)
         self.flights, self._mirrors = flights, mirrors
         self._scene, self._L, self._δL, self._detour_L = scene, L, δL, detour_L
         if δL is None:

@@ -113,21 +113,26 @@ def test_gradients_agree_with_prbvolpath() -> None:
         assert found.std(ddof=1) < (0.4 if "sigma_t.data" in key else 0.2) * abs(found.mean()), key
 
 
+def in_a_furnace(medium: dict[str, Any]) -> dict[str, Any]:
+    """A cube under a constant sky, seen along its axis."""
+    view = lookat([0, 0, 9], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "sensor": sensor(to_world=view, fov=3.0, film=film(4, 4)),
+        "sky": {"type": "constant", "radiance": 1.0},
+        "cloud": cube(medium),
+    }
+
+
 @pytest.mark.parametrize("share_of_empty", [0.5, 1.0, None])
 def test_in_a_white_furnace_extinction_has_no_gradient_where_a_medium_is_empty(
     share_of_empty: float | None,
 ) -> None:
     """What scatters into a ray replaces what scatters out of it. A path that scatters in proportion
     to the extinction never finds the former: the derivative would be −2, the length of the way."""
-    view = lookat([0, 0, 9], [0, 0, 0], [0, 1, 0])
-    scene = {
-        "type": "scene",
-        "sensor": sensor(to_world=view, fov=3.0, film=film(4, 4)),
-        "sky": {"type": "constant", "radiance": 1.0},
-        "cloud": cube(homogeneous(0.0, 1.0) if share_of_empty is None
-                      else cloud(density(share_of_empty), albedo=1.0)),
-    }  # fmt: skip
-    loaded, parameters = load(scene)
+    empty = homogeneous(0.0, 1.0)
+    medium = empty if share_of_empty is None else cloud(density(share_of_empty), albedo=1.0)
+    loaded, parameters = load(in_a_furnace(medium))
     (key,) = keys_of(parameters, ".sigma_t.data", ".sigma_t.value.value")
     integrator = make(max_depth=-1)
     found = np.array(
@@ -137,6 +142,23 @@ def test_in_a_white_furnace_extinction_has_no_gradient_where_a_medium_is_empty(
     for sum_of_some in (found[:, is_empty].sum(axis=1), found.sum(axis=1)):
         assert abs(z_scores(sum_of_some, 0.0)) < 6
         assert sum_of_some.std(ddof=1) < 0.15
+
+
+def test_black_fog_has_the_gradient_of_the_light_that_it_would_scatter_once() -> None:
+    """The integral, along a ray through the cube, of σ T(t) and the mean transmittance of the ways
+    from there to the sky."""
+    loaded, parameters = load(in_a_furnace(homogeneous(1.0, [0.0, 0.0, 0.5], 0.0)))
+    (key,) = keys_of(parameters, ".albedo.value.value")
+    dr.enable_grad(parameters[key])
+    image = mi.render(loaded, parameters, integrator=make(max_depth=3), seed=1, spp=8192)
+    dr.backward(dr.mean(image[..., :1], axis=None))
+    d = np.random.default_rng(1).normal(size=(20000, 1, 3))
+    d /= np.linalg.norm(d, axis=2, keepdims=True)
+    x, weights = np.polynomial.legendre.leggauss(8)
+    p = np.stack([0 * x, 0 * x, x], axis=1)
+    way = ((1 - np.sign(d) * p) / abs(d)).min(axis=2)
+    expected = np.sum(weights * np.exp(-(1 + x)) * np.exp(-way).mean(axis=0))
+    assert dr.grad(parameters[key]).x[0] == pytest.approx(expected, rel=0.03)
 
 
 def test_forward_and_backward_mode_agree() -> None:
@@ -181,6 +203,10 @@ HARD = {
                  "fog": {**cube(homogeneous(1.0, 0.7)),
                          "bsdf": {"type": "roughdielectric", "alpha": 0.3}}},
         {},
+    ),
+    "guided distances": (
+        lambda: fog_around_the_camera("area", homogeneous([0.2, 0.1, 0.1], [0.8, 0.6, 0.9])),
+        {"directions": {"type": "guided_directions", "always_guide": True}, "pilot_spp": 64},
     ),
     "black fog beside empty fog": (
         lambda: {**fog("area", homogeneous([1.0, 0.5, 0.3], [0.0, 0.6, 0.9])),
