@@ -15,6 +15,7 @@ Transactions on Graphics 43(6), 2024 (the probability of scattering). The warp i
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -25,8 +26,11 @@ from ...util.discrete_sampling import ONE_MINUS_EPSILON
 from .regions_with_media import RegionsWithMedia
 from .scattered_light import ScatteredLight
 
-#: The number of cells of the numbers that lead to a collision.
-_CELLS = 16
+#: The number of cells of the numbers that lead to a collision, and how often a cell is halved.
+_CELLS, _HALVINGS = 8, 4
+
+#: Light gets no further than this number of mean free paths: all greater numbers are 1.
+_FARTHEST = 17.0
 
 #: The share of the numbers that are warped; the others are uniform. So the throughput of a path is
 #: at most doubled by each flight.
@@ -51,12 +55,12 @@ class GuidedDistances(Distances):
     ) -> None:
         self.light, self.regions, self.surfaces, self.flights = light, regions, surfaces, flights
         # Opaque: the kernel is the same for all values
-        self._flights, self._cells = dr.opaque(mi.UInt32, flights), dr.opaque(mi.UInt32, _CELLS)
+        self._flights = dr.opaque(mi.UInt32, flights)
         dr.make_opaque(self.surfaces)
 
     def kernel_state(self) -> tuple:
         """The attributes on which kernels depend (``frozen.py``)."""
-        return self.light, self.regions, self.surfaces, self._flights, self._cells
+        return self.light, self.regions, self.surfaces, self._flights
 
     def begin(self, rays) -> Any:
         return super().begin(rays), mi.UInt32(0)
@@ -82,19 +86,20 @@ class GuidedDistances(Distances):
         )
 
     def _warp(self, u, o, d, end, si, σ, σ_s):
-        # Camera rays end at the far clip plane
-        end = dr.minimum(si.t, end)
+        # Camera rays end at the far clip plane, and no number leads further than this
+        end = dr.minimum(dr.minimum(si.t, end), _FARTHEST / σ)
         # The probability of a collision before that, and the width of a cell
-        collides = 1 - dr.select(dr.isfinite(end), dr.exp(-σ * end), 0)
-        width = collides / mi.Float(self._cells)
+        collides = 1 - dr.exp(-σ * end)
+        width = collides * (1 / _CELLS)
         warps = u < SHARE
         u = dr.select(warps, u / SHARE, (u - SHARE) / (1 - SHARE))
         u = dr.minimum(u, ONE_MINUS_EPSILON)
-        # The cell of a uniform number; the last one stands for the surface
-        cell = mi.UInt32(dr.minimum(u / dr.maximum(width, 1e-30), mi.Float(self._cells)))
-        cell, of_cell, total, v = self._choose(o, d, σ, width, warps, u, cell)
+        ray = _Ray(*self.light.box.in_voxels(o, d), -dr.rcp(σ))
+        ends = [mi.Float(0), *(ray.distance(k * width) for k in range(1, _CELLS)), end]
+        found = [self.light.around(*ray.between(*pair)) for pair in zip(ends, ends[1:])]
+        total = sum(found)
         albedo = σ_s / σ
-        of_cell, of_medium = of_cell * albedo, total * albedo / mi.Float(self._cells)
+        of_medium = total * albedo * (1 / _CELLS)
         of_surface = dr.gather(
             mi.Float, self.surfaces, self.regions.label(si, None, mi.Bool(True))
         )
@@ -103,37 +108,79 @@ class GuidedDistances(Distances):
         of_surface = dr.select(is_known, of_surface, of_medium)
         mean = collides * of_medium + (1 - collides) * of_surface
         warps &= mean > 0
-        scattered = collides * of_medium / mean
-        passes = v >= scattered
-        w = dr.select(passes, (v - scattered) / (1 - scattered), v / scattered)
-        number = dr.select(passes, collides + w * (1 - collides), (mi.Float(cell) + w) * width)
-        number = dr.minimum(dr.select(warps, number, u), ONE_MINUS_EPSILON)
-        scatters = dr.select(warps, ~passes, u < collides)
-        density = dr.select(scatters, of_cell, of_surface) / mean
+        scattered = dr.select(warps, collides * of_medium / mean, collides)
+        passes = u >= scattered
+        u = dr.select(passes, (u - scattered) / (1 - scattered), u / scattered)
+        # The cell: by the radiance in it, or by its width
+        place = u * dr.select(warps, total, _CELLS)
+        first, near, far = mi.Float(0), ends[0], ends[1]
+        of_cell, before, after = found[0], mi.Float(0), mi.Float(0)
+        for k in range(_CELLS):
+            size = dr.select(warps, found[k], 1)
+            before, after = after, after + size
+            takes = (place >= before) & (size > 0)
+            first = dr.select(takes, mi.Float(k), first)
+            start = dr.select(takes, before, start) if k else mi.Float(0)
+            of_cell, near, far = (
+                dr.select(takes, new, old)
+                for new, old in ((found[k], of_cell), (ends[k], near), (ends[k + 1], far))
+            )
+        inside = (place - start) / dr.select(warps, of_cell, 1)
+        inside = dr.clip(inside, 0, ONE_MINUS_EPSILON)
+        number, finer = self._descend(
+            ray, first * width, width, near, far, inside, warps, ~passes
+        )
+        density = dr.select(passes, of_surface, of_cell * finer * albedo) / mean
         density = dr.select(mean > 0, density, 1)
-        t = dr.select(scatters, dr.minimum(-dr.log(1 - number) / σ, end), si.t)
-        return t, scatters, dr.rcp(dr.fma(SHARE, density, 1 - SHARE))
+        t = dr.minimum(ray.distance(number), end)
+        weight = dr.rcp(dr.fma(SHARE, density, 1 - SHARE))
+        return dr.select(passes, si.t, t), ~passes, weight
 
     @dr.syntax
-    def _choose(self, o, d, σ, width, warps, u, cell):
-        """Chooses a cell in proportion to its radiance where ``warps``, in one pass over the cells;
-        elsewhere keeps ``cell``.
+    def _descend(self, ray, first, width, near, far, u, warps, active):
+        """Halves a cell until its parts are as small as a voxel.
 
         Returns:
-            The cell, its radiance, the sum over the cells, and the uniform number that is left of
-            ``u`` where ``warps``.
+            A number in the cell, and its density relative to uniform numbers.
         """
-        u, cell = mi.Float(u), mi.UInt32(cell)
-        index, total, of_cell = mi.UInt32(0), mi.Float(0), mi.Float(0)
-        while index < self._cells:
-            x = self.light.at(o - d * (dr.log(1 - (mi.Float(index) + 0.5) * width) / σ))
-            total += x
-            p = dr.select(total > 0, x / total, 0)
-            takes = warps & (u < p)
-            is_chosen = takes | (~warps & (cell == index))
-            u = dr.select(takes, u / p, dr.select(warps, (u - p) / (1 - p), u))
+        density, active, level = mi.Float(1), mi.Bool(active), mi.UInt32(0)
+        first, width, near, far, u = (mi.Float(x) for x in (first, width, near, far, u))
+        while active & (ray.between(near, far)[1] > 1) & (level < _HALVINGS):
+            width *= 0.5
+            middle = ray.distance(first + width)
+            of_near = self.light.around(*ray.between(near, middle))
+            of_far = self.light.around(*ray.between(middle, far))
+            both = of_near + of_far
+            p = dr.select(both > 0, of_near / both, 0.5)
+            share = dr.select(warps, p, 0.5)
+            is_near = u < share
+            u = dr.select(is_near, u, u - share) / dr.select(is_near, share, 1 - share)
             u = dr.minimum(u, ONE_MINUS_EPSILON)
-            of_cell = dr.select(is_chosen, x, of_cell)
-            cell = dr.select(takes, index, cell)
-            index += 1
-        return cell, of_cell, total, u
+            density *= 2 * dr.select(is_near, p, 1 - p)
+            first = dr.select(is_near, first, first + width)
+            near, far = dr.select(is_near, near, middle), dr.select(is_near, middle, far)
+            level += 1
+        return dr.fma(u, width, first), density
+
+
+@dataclass
+class _Ray:
+    """A ray through a homogeneous medium, in units of voxels.
+
+    Attributes:
+        o, d: Its origin, and the way of a unit of distance.
+        scale: −1 / extinction.
+    """
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    scale: mi.Float
+
+    def distance(self, number: mi.Float) -> mi.Float:
+        """The distance to which a number leads."""
+        return dr.log(1 - number) * self.scale
+
+    def between(self, near: mi.Float, far: mi.Float) -> tuple[mi.Point3f, mi.Float]:
+        """The point in the middle between two distances, and the length between them."""
+        length = (far - near) * dr.max(dr.abs(self.d))
+        return dr.fma(self.d, 0.5 * (near + far), self.o), length

@@ -11,11 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...scene.regions.surface_voxels import voxel_at, voxel_coordinates
+from ...scene.regions.surface_voxels import voxel_coordinates
 from ...transport.numbers import HashedNumbers
 from ...transport.path_decisions import SceneQuery
 from ...transport.transmittance import transmittance
-from ...util.arrays import channel_mean
+from ...util.arrays import channel_mean, from_numpy
 
 #: The number of voxels along each axis.
 RESOLUTION = 64
@@ -23,7 +23,7 @@ RESOLUTION = 64
 #: The number of points of each voxel after each pilot at which direct light is computed.
 _POINTS = 4
 
-_VOXELS = RESOLUTION**3
+_VOXELS, _LEVELS = RESOLUTION**3, RESOLUTION.bit_length() - 1
 
 
 class Box:
@@ -43,14 +43,15 @@ class Box:
         corner = mi.Point3f(*map(mi.Float, voxel_coordinates(voxel, RESOLUTION)))
         return self._origin + (corner + sample) * self._edges
 
-    def voxel(self, p: mi.Point3f) -> tuple[mi.UInt32, mi.Bool]:
-        """The voxel of a point, and whether there is one."""
-        voxel, inside = voxel_at((p - self._origin) / self._edges, RESOLUTION, mi.Bool(True))
-        return mi.UInt32(voxel), inside
+    def in_voxels(self, p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
+        """A point and a vector in units of voxels, from the lower corner."""
+        return mi.Point3f((p - self._origin) / self._edges), d / self._edges
 
 
 class ScatteredLight:
-    """A table of the radiance that an isotropic medium without absorption would scatter.
+    """The radiance that an isotropic medium without absorption would scatter: a table of voxels,
+    and of cubes of 2, 4, 8, … voxels along each edge. A cube has the root mean square of its
+    voxels: best for a ray that crosses it at an unknown place.
 
     Parameters (and attributes):
         box: The voxels.
@@ -60,17 +61,43 @@ class ScatteredLight:
 
     def __init__(self, box: Box, values: mi.Float, outside: mi.Float) -> None:
         self.box, self.values, self.outside = box, values, outside
+        self._cubes = from_numpy(mi.Float, _cubes(values.numpy()))
         dr.make_opaque(self.values, self.outside)
+
+    def kernel_state(self) -> tuple:
+        """The attributes on which kernels depend (``frozen.py``)."""
+        return self.box, self._cubes, self.outside
 
     @classmethod
     def unknown(cls, box: Box) -> ScatteredLight:
         """No light anywhere."""
         return cls(box, dr.zeros(mi.Float, _VOXELS), mi.Float(0))
 
-    def at(self, p: mi.Point3f) -> mi.Float:
-        """The radiance at a point."""
-        voxel, inside = self.box.voxel(p)
-        return dr.select(inside, dr.gather(mi.Float, self.values, voxel, inside), self.outside)
+    def around(self, p: mi.Point3f, size: mi.Float) -> mi.Float:
+        """The radiance in the cube around a point whose edge is between a half of ``size`` and
+        ``size``, or in a voxel. The units are voxels (:meth:`Box.in_voxels`)."""
+        # The exponent of a number of single precision
+        level = mi.Int32(dr.reinterpret_array(mi.UInt32, mi.Float32(size)) >> 23) - 127
+        level = dr.clip(level, 0, _LEVELS)
+        count = RESOLUTION >> mi.UInt32(level)
+        p *= mi.Float(count) / RESOLUTION
+        x, y, z = (mi.UInt32(mi.Int32(dr.floor(x))) for x in p)
+        # As unsigned numbers, negative ones are large
+        inside = (x < count) & (y < count) & (z < count)
+        index = x + count * (y + count * (z + count))
+        return dr.select(inside, dr.gather(mi.Float, self._cubes, index, inside), self.outside)
+
+
+def _cubes(values: np.ndarray) -> np.ndarray:
+    """The table of all cubes: those of a grid of n³ cubes begin at n³."""
+    cubes, size = np.zeros(2 * _VOXELS, np.float32), RESOLUTION
+    square = np.square(values, dtype=np.float64).reshape([size] * 3)
+    while True:
+        cubes[size**3 : 2 * size**3] = np.sqrt(square).ravel()
+        if size == 1:
+            return cubes
+        size //= 2
+        square = square.reshape(size, 2, size, 2, size, 2).mean(axis=(1, 3, 5))
 
 
 class DirectLight:
