@@ -32,7 +32,7 @@ class DistanceLearner(Learner):
 
     Attributes:
         decision (GuidedDistances): What was learned; ``None`` where nothing is guided.
-        gain: The relative reduction of variance in the last pilot.
+        gain: The relative reduction of variance in the pilots.
     """
 
     def __init__(self, guide: GuideLearner, time: float, always: bool) -> None:
@@ -40,6 +40,7 @@ class DistanceLearner(Learner):
         self.decision: GuidedDistances | None = None
         self.gain: float | None = None
         self._direct: DirectLight | None = None
+        self._evidence: np.ndarray | float = 0.0
         self._medium: mi.UInt32 | None = None
         guide.learn_flights(self)
 
@@ -87,20 +88,26 @@ class DistanceLearner(Learner):
         if self.decision is None:
             return
         if self._direct.points > 0:
-            self.gain, error = gain_of(self._sums(records))
+            self._evidence = self._evidence + self._sums(records)
+            self.gain, error = gain_of(self._evidence)
+            # Until the last pilot, learning goes on if distances may pay
+            least = (1 - self.gain) * np.exp(0 if pilot.is_last else -error)
             share = self._guide.known
-            prediction = Prediction(1 - self.gain, GUIDED_FLIGHTS, error, share, grows=True)
+            prediction = Prediction(least, GUIDED_FLIGHTS, error, share, grows=True)
             if not (self._always or pilot.pays(prediction)):
                 self.decision = self._direct = self._medium = None
                 return
+        elif self._guide.guidance is None and not pilot.is_last:
+            # Whether directions are guided is not known yet
+            return
         centre = mi.Point3f(0.5)
         voxel = dr.arange(mi.UInt32, RESOLUTION**3)
         region = regions.of_media(self._box.point(voxel, centre))
         medium = dr.reinterpret_array(mi.MediumPtr, dr.gather(mi.UInt32, self._medium, region))
         scene = pilot.scene
         self._direct.add(scene, scene_query(scene), medium, may_have_grids(scene), self._time)
-        # What media scatter more than once
-        indirect = regions.incident_radiance(records)
+        # What media scatter more than once; nothing where it is unknown
+        indirect = dr.maximum(regions.incident_radiance(records), 0)
         values = self._direct.mean + dr.gather(mi.Float, indirect, region)
         outside = dr.gather(mi.Float, indirect, regions.of_media(mi.Point3f(dr.inf)))
         samples = records.samples
@@ -111,12 +118,13 @@ class DistanceLearner(Learner):
 
     def _sums(self, records: PathRecords) -> np.ndarray:
         """For each batch of the last pilot's paths: the variance, and what distances have saved."""
-        new = dr.arange(mi.UInt32, records.count) >= dr.opaque(mi.UInt32, records.first_new)
+        square, variances = records.squares(records.found)
+        new = dr.arange(mi.UInt32, len(square)) + dr.opaque(mi.UInt32, records.first_new)
         # The mean of value² / weight is the second moment of uniform numbers
-        saved = dr.square(records.found) * records.importance * (dr.rcp(records.flight) - 1)
+        saved = square * (dr.rcp(dr.gather(mi.Float, records.flight, new)) - 1)
         sums = dr.zeros(mi.Float64, BATCHES)
-        dr.scatter_add(sums, mi.Float64(saved), records.batch, new & dr.isfinite(saved))
-        return np.stack([records.variances, sums.numpy()])
+        dr.scatter_add(sums, mi.Float64(saved), dr.gather(mi.UInt32, records.batch, new))
+        return np.stack([variances, sums.numpy()])
 
     def learn(self, pilot: Pilot) -> GuidedDistances | None:
         if self._guide.guide is None:
@@ -147,6 +155,12 @@ class DistanceLearner(Learner):
         surfaces = from_numpy(mi.Float, surfaces)
         self.decision = GuidedDistances(light, regions, surfaces, flights)
         return self.decision
+
+    @property
+    def efficiency(self) -> float:
+        if self.decision is None or self.gain is None:
+            return 1.0
+        return 1 / (max(1 - self.gain, 1e-3) * GUIDED_FLIGHTS)
 
     @property
     def effect(self) -> Effect | None:

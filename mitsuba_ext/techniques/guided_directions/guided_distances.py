@@ -71,10 +71,8 @@ class GuidedDistances(Distances):
         return u, (used, count + dr.select(active, mi.UInt32(1), 0))
 
     def is_late(self, state):
-        used, count = state
-        # The number of a camera ray has a density of its own
-        first = mi.UInt32(1 if used is None else 2)
-        return (count >= first) & (count <= self._flights)
+        _, count = state
+        return (count > 0) & (count <= self._flights)
 
     def warp(self, u, ray, si, σ, σ_s, active):
         # A branch, so that flights that are not guided cost nothing

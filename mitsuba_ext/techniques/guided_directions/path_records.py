@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.evidence import BATCHES
+from ...planning.evidence import BATCHES, TRIM
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...util.arrays import joined
@@ -174,6 +174,29 @@ class PathRecords(Observer):
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
 
     # ---- Between passes ----
+
+    def squares(self, value: mi.Float) -> tuple[mi.Float, np.ndarray]:
+        """The weighted squares of the last pilot's values (from ``first_new`` on), and ``variances``.
+        As in ``evidence.py``, the brightest paths do not count: one in ``TRIM`` counts no more than
+        the next brightest.
+
+        Parameters:
+            value: A column of :class:`Samples`: what paths contributed after a place.
+        """
+        new = dr.arange(mi.UInt32, self.count - self.first_new)
+        new += dr.opaque(mi.UInt32, self.first_new)
+        value, importance = (dr.gather(mi.Float, x, new) for x in (value, self.importance))
+        square = dr.minimum(dr.square(value) * importance, 1e30)
+        # The contribution after the first vertex stands for the whole path
+        first = dr.compress(dr.gather(mi.UInt32, self.bounce, new) == 0)
+        of_paths = dr.gather(mi.Float, square, first).numpy()
+        left_out = -(-self.paths // TRIM)
+        if len(of_paths) <= left_out:
+            return square, self.variances
+        most = np.partition(of_paths, -left_out - 1)[-left_out - 1]
+        batch = dr.gather(mi.UInt32, self.batch, dr.gather(mi.UInt32, new, first)).numpy()
+        excess = np.bincount(batch, np.maximum(of_paths - most, 0), BATCHES)
+        return dr.minimum(square, dr.opaque(mi.Float, most)), self.variances - excess
 
     def chosen(self, chosen: mi.Bool) -> Samples:
         """Some of the samples, after :meth:`finish`."""

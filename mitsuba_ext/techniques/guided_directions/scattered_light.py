@@ -21,7 +21,7 @@ from ...util.arrays import channel_mean, from_numpy
 RESOLUTION = 64
 
 #: The number of points of each voxel after each pilot at which direct light is computed.
-_POINTS = 4
+_POINTS = 2
 
 _VOXELS, _LEVELS = RESOLUTION**3, RESOLUTION.bit_length() - 1
 
