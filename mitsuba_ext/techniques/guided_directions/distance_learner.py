@@ -173,3 +173,24 @@ class DistanceLearner(Learner):
             return ""
         kept = "distances in media" if self.decision is not None else "no distances in media"
         return f"{kept}: about {max(self.gain, 0):.0%} less variance"
+
+
+class UnguidedGrids(Learner):
+    """Says that distances in grids are not guided. Delta tracking draws many numbers for a flight,
+    and the first of them decides little.
+
+    Parameters:
+        guide: The learner of directions.
+    """
+
+    def __init__(self, guide: GuideLearner) -> None:
+        self._guide = guide
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
+        return None
+
+    def learn(self, pilot: Pilot) -> None:
+        return None
+
+    def __str__(self) -> str:
+        return "distances in grids are not guided" if self._guide.guide is not None else ""

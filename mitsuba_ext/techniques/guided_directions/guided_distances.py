@@ -112,17 +112,14 @@ class GuidedDistances(Distances):
         # The cell: by the radiance in it, or by its width
         place = u * dr.select(warps, total, _CELLS)
         first, near, far = mi.Float(0), ends[0], ends[1]
-        of_cell, before, after = found[0], mi.Float(0), mi.Float(0)
+        of_cell, before, after, start = found[0], mi.Float(0), mi.Float(0), mi.Float(0)
         for k in range(_CELLS):
             size = dr.select(warps, found[k], 1)
             before, after = after, after + size
             takes = (place >= before) & (size > 0)
             first = dr.select(takes, mi.Float(k), first)
-            start = dr.select(takes, before, start) if k else mi.Float(0)
-            of_cell, near, far = (
-                dr.select(takes, new, old)
-                for new, old in ((found[k], of_cell), (ends[k], near), (ends[k + 1], far))
-            )
+            start, of_cell = dr.select(takes, before, start), dr.select(takes, found[k], of_cell)
+            near, far = dr.select(takes, ends[k], near), dr.select(takes, ends[k + 1], far)
         inside = (place - start) / dr.select(warps, of_cell, 1)
         inside = dr.clip(inside, 0, ONE_MINUS_EPSILON)
         number, finer = self._descend(

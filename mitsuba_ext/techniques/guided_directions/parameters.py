@@ -9,8 +9,8 @@ import mitsuba as mi
 from ...planning.learner import Learner
 from ...planning.technique import ParameterReader, Setting, Technique
 from ...rendering.camera import film_extent
-from ...scene.media import has_homogeneous_media, may_have_media
-from .distance_learner import DistanceLearner
+from ...scene.media import has_homogeneous_media, may_have_media, scene_media
+from .distance_learner import DistanceLearner, UnguidedGrids
 from .guided_roulette import RouletteLearner
 from .learner import GuideLearner
 from .regions_with_media import RegionsWithMedia
@@ -110,7 +110,8 @@ class GuidedFlights(Technique):
         if not isinstance(guide, GuideLearner) or not guide.wants_scout:
             return None
         if not has_homogeneous_media(setting.scene):
-            return None
+            has_grids = next(scene_media(setting.scene), None) is not None
+            return UnguidedGrids(guide) if has_grids else None
         return DistanceLearner(guide, setting.sensor.shutter_open(), guide.always)
 
 

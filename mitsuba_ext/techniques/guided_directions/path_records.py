@@ -176,9 +176,9 @@ class PathRecords(Observer):
     # ---- Between passes ----
 
     def squares(self, value: mi.Float) -> tuple[mi.Float, np.ndarray]:
-        """The weighted squares of the last pilot's values (from ``first_new`` on), and ``variances``.
-        As in ``evidence.py``, the brightest paths do not count: one in ``TRIM`` counts no more than
-        the next brightest.
+        """The weighted squares of the last pilot's values (from ``first_new`` on), and
+        ``variances``; without the brightest paths (``evidence.py``): one in ``TRIM`` counts no more
+        than the next brightest.
 
         Parameters:
             value: A column of :class:`Samples`: what paths contributed after a place.

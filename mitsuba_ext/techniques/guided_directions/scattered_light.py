@@ -51,7 +51,8 @@ class Box:
 class ScatteredLight:
     """The radiance that an isotropic medium without absorption would scatter: a table of voxels,
     and of cubes of 2, 4, 8, … voxels along each edge. A cube has the root mean square of its
-    voxels: best for a ray that crosses it at an unknown place.
+    voxels and (a quarter along each axis) of those around it, which is best for a ray that crosses
+    it at an unknown place.
 
     Parameters (and attributes):
         box: The voxels.
@@ -80,8 +81,9 @@ class ScatteredLight:
         level = mi.Int32(dr.reinterpret_array(mi.UInt32, mi.Float32(size)) >> 23) - 127
         level = dr.clip(level, 0, _LEVELS)
         count = RESOLUTION >> mi.UInt32(level)
-        p *= mi.Float(count) / RESOLUTION
-        x, y, z = (mi.UInt32(mi.Int32(dr.floor(x))) for x in p)
+        x, y, z = (
+            mi.UInt32(mi.Int32(dr.floor(x))) for x in p * (mi.Float(count) / RESOLUTION)
+        )
         # As unsigned numbers, negative ones are large
         inside = (x < count) & (y < count) & (z < count)
         index = x + count * (y + count * (z + count))
@@ -91,13 +93,22 @@ class ScatteredLight:
 def _cubes(values: np.ndarray) -> np.ndarray:
     """The table of all cubes: those of a grid of n³ cubes begin at n³."""
     cubes, size = np.zeros(2 * _VOXELS, np.float32), RESOLUTION
+    cubes[_VOXELS:] = values
     square = np.square(values, dtype=np.float64).reshape([size] * 3)
-    while True:
-        cubes[size**3 : 2 * size**3] = np.sqrt(square).ravel()
-        if size == 1:
-            return cubes
+    while size > 1:
         size //= 2
+        # A part of a ray whose middle is in a cube may end beside it
+        wide = _halved(_halved(_halved(square, 0), 1), 2)
+        cubes[size**3 : 2 * size**3] = np.sqrt(wide).ravel()
         square = square.reshape(size, 2, size, 2, size, 2).mean(axis=(1, 3, 5))
+    return cubes
+
+
+def _halved(x: np.ndarray, axis: int) -> np.ndarray:
+    """Means of pairs along an axis, to which the neighbours of a pair contribute a quarter."""
+    padded = np.pad(np.moveaxis(x, axis, 0), ((1, 1), (0, 0), (0, 0)), "edge")
+    before, first, second, after = (padded[i : i + x.shape[axis] : 2] for i in range(4))
+    return np.moveaxis((before + 3 * first + 3 * second + after) / 8, 0, axis)
 
 
 class DirectLight:

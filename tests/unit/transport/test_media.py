@@ -297,6 +297,8 @@ SEEING = {
     "rejecting": {"type": "neepp", "rejection": True, "light_sampling": "uniform",
                   "slope": 2.0, "floor": 0.3},
     "guided": {"type": "pss_guided", "always_guide": True},
+    "guided_and_maps": {"type": "composed_path", "distance": "swarm", "directions": {
+        "type": "guided_directions", "always_guide": True}},
     "tiles": {"type": "pss_guided", "always_guide": True, "regions": "tiles", "tile": 4},
     "auto_path": {"type": "auto_path", "pilot_spp": 32},
     "many": {"type": "reweighted_direct", "light_samples": 3},

@@ -91,6 +91,18 @@ def test_a_stage_without_a_path_that_scatters_has_no_records() -> None:
     assert (records.count, records.paths) == (0, 1)
 
 
+def test_the_brightest_path_counts_no_more_than_the_next() -> None:
+    records, _, _ = _recorded()
+    records.importance = mi.Float(1 + np.arange(records.count))
+    square, variances = records.squares(records.value)
+    whole = (dr.square(records.value) * records.importance).numpy()
+    *_, next_brightest, brightest = np.sort(whole[records.bounce.numpy() == 0])
+    assert brightest > next_brightest
+    np.testing.assert_allclose(square.numpy(), np.minimum(whole, next_brightest), rtol=1e-6)
+    left_out = records.variance - variances.sum()
+    assert left_out == pytest.approx(brightest - next_brightest, rel=1e-4)
+
+
 def test_infinite_radiance_decides_nothing() -> None:
     records = PathRecords(lambda si, pixel, active: pixel, 1, 1, PixelEstimates(4, 4))
     records.begin(4, dr.arange(mi.UInt32, 4))
