@@ -72,7 +72,7 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     scatters before the next surface. Both follow the radiance along the ray. What lamps send to the
     fog is computed in a grid of 64 x 64 x 64 voxels; what fog and surfaces scatter is learned. Half
     of the distances are drawn as by :monosp:`volpath`. Distances in grids (:monosp:`heterogeneous`)
-    are not guided.
+    are not guided; the summary of what was learned says so.
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, to no effect). With regions of surfaces, Russian roulette is learned as

@@ -4,8 +4,14 @@ The number that chooses the distance of a flight is warped. Uniform numbers choo
 the probability that light gets that far and collides. The best density of a number is therefore
 proportional to what the path finds in its place: the radiance that is scattered there or, for
 numbers that lead to the surface at the end of the flight, the radiance that leaves the surface. The
-numbers that lead to a collision are divided into equal cells, each of which stands for the radiance
-in its middle. The warp thus decides whether a path scatters before the surface, and where.
+warp thus decides whether a path scatters before the surface, and where.
+
+The numbers that lead to a collision are divided into equal cells, and the chosen cell is halved
+until it is as long as a voxel. The radiance in a part of the ray is the one in a cube of about its
+length (:class:`ScatteredLight`). That takes 8 look-ups for the cells and 2 for each half.
+
+A map of the numbers of camera rays (``distance=swarm``) works on top of this: it weighs the numbers
+before they are warped.
 
 Sources: S. Herholz et al., *Volume Path Guiding Based on Zero-Variance Random Walk Theory*, ACM
 Transactions on Graphics 38(3), 2019, section 5.1 (distances in proportion to transmittance times
@@ -29,8 +35,8 @@ from .scattered_light import ScatteredLight
 #: The number of cells of the numbers that lead to a collision, and how often a cell is halved.
 _CELLS, _HALVINGS = 8, 4
 
-#: Light gets no further than this number of mean free paths: all greater numbers are 1.
-_FARTHEST = 17.0
+#: No number below 1 leads further than this number of mean free paths.
+_FARTHEST = 18.0
 
 #: The share of the numbers that are warped; the others are uniform. So the throughput of a path is
 #: at most doubled by each flight.

@@ -106,6 +106,7 @@ class GuideLearner(Learner):
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
         self._batches: list[np.ndarray] = []
+        self._variances = np.zeros(BATCHES)
 
     def start(
         self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f
@@ -231,7 +232,7 @@ class GuideLearner(Learner):
             self.guidance = most_efficient(gains, self.always, *against_path, rays)
             share, bounces, gain, efficiency = self.guidance
             prediction = Prediction(
-                1 - gain, 1 / (max(1 - gain, 1e-3) * efficiency), self._error(records), known, True
+                1 - gain, 1 / (max(1 - gain, 1e-3) * efficiency), self._error(), known, True
             )
             if is_trial(known, pilot.is_last):
                 bounces = self.bounces
@@ -310,11 +311,9 @@ class GuideLearner(Learner):
         same roulette: for each share of samples that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, records.count - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
-        value, weight, importance, bounce = (
-            dr.gather(type(x), x, new)
-            for x in (records.value, records.weight, records.importance, records.bounce)
-        )
-        square, drawn = dr.square(value) * importance, dr.rcp(weight)
+        weight, bounce = (dr.gather(type(x), x, new) for x in (records.weight, records.bounce))
+        square, self._variances = records.squares(records.value)
+        drawn = dr.rcp(weight)
         density = (drawn - (1 - self._share)) / self._share
 
         place = bounce * BATCHES + dr.gather(mi.UInt32, records.batch, new)
@@ -331,18 +330,18 @@ class GuideLearner(Learner):
         dr.eval(found)
         self._batches = [x.numpy().reshape(-1, BATCHES) for x in found]
         uniform, actual, *others = (x.sum(axis=1) for x in self._batches)
-        variance = max(records.variance + (uniform - actual).sum(), 1e-30)
+        variance = max(self._variances.sum() + (uniform - actual).sum(), 1e-30)
         gains = {share: (uniform - x) / variance for share, x in zip(_SHARES, others)}
         # Where squares of large numbers overflow, no gain is shown
         return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
 
-    def _error(self, records: PathRecords) -> float:
+    def _error(self) -> float:
         """The standard error of the logarithm of the variance that remains with the guidance."""
         if not self._batches:
             return 0.0
         uniform, actual, *others = self._batches
         other = others[_SHARES.index(self.guidance.share)][: self.guidance.bounces].sum(axis=0)
-        before = records.variances + (uniform - actual).sum(axis=0)
+        before = self._variances + (uniform - actual).sum(axis=0)
         more = uniform[: self.guidance.bounces].sum(axis=0) - other
         return gain_of(np.stack([before - more, more]))[1]
 
