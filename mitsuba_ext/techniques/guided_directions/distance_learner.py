@@ -87,7 +87,7 @@ class DistanceLearner(Learner):
         """Learns from all records, of which those from ``first_new`` on are the last pilot's."""
         if self.decision is None:
             return
-        if self._direct.points > 0:
+        if self._direct.points > 0 and records.count > records.first_new:
             self._evidence = self._evidence + self._sums(records)
             self.gain, error = gain_of(self._evidence)
             # Until the last pilot, learning goes on if distances may pay
@@ -123,7 +123,8 @@ class DistanceLearner(Learner):
         # The mean of value² / weight is the second moment of uniform numbers
         saved = square * (dr.rcp(dr.gather(mi.Float, records.flight, new)) - 1)
         sums = dr.zeros(mi.Float64, BATCHES)
-        dr.scatter_add(sums, mi.Float64(saved), dr.gather(mi.UInt32, records.batch, new))
+        batch = dr.gather(mi.UInt32, records.batch, new)
+        dr.scatter_add(sums, mi.Float64(saved), batch, dr.isfinite(saved))
         return np.stack([variances, sums.numpy()])
 
     def learn(self, pilot: Pilot) -> GuidedDistances | None:
@@ -155,12 +156,6 @@ class DistanceLearner(Learner):
         surfaces = from_numpy(mi.Float, surfaces)
         self.decision = GuidedDistances(light, regions, surfaces, flights)
         return self.decision
-
-    @property
-    def efficiency(self) -> float:
-        if self.decision is None or self.gain is None:
-            return 1.0
-        return 1 / (max(1 - self.gain, 1e-3) * GUIDED_FLIGHTS)
 
     @property
     def effect(self) -> Effect | None:

@@ -196,7 +196,7 @@ class PathRecords(Observer):
         most = np.partition(of_paths, -left_out - 1)[-left_out - 1]
         batch = dr.gather(mi.UInt32, self.batch, dr.gather(mi.UInt32, new, first)).numpy()
         excess = np.bincount(batch, np.maximum(of_paths - most, 0), BATCHES)
-        return dr.minimum(square, dr.opaque(mi.Float, most)), self.variances - excess
+        return dr.minimum(square, dr.opaque(mi.Float, float(most))), self.variances - excess
 
     def chosen(self, chosen: mi.Bool) -> Samples:
         """Some of the samples, after :meth:`finish`."""
