@@ -52,9 +52,9 @@ class Auto(LightPathIntegrator):
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
-         all samples (a quarter in short renders). They count towards the image. With 0, it learns
-         nothing and renders as :monosp:`path` does, with a light tree. If it is given, short
-         renders learn too. (Default: 32)
+         all samples up to 262144 pilot samples, a sixteenth beyond, and a quarter in short renders.
+         They count towards the image. With 0, it learns nothing and renders as :monosp:`path` does,
+         with a light tree. (Default: 32; 0 in renders of fewer than 262144 samples)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -83,16 +83,17 @@ class Auto(LightPathIntegrator):
     these choices if it is better than guided directions and maps. Maps are then dropped. Guided
     directions that paid before are learned again, from samples with light paths, unless vertices
     are merged; together with light paths, a guide is expected to keep the square root of its
-    efficiency. The trial has 16384 samples, spread over the film, which are not part of the image;
-    in renders of less than four million samples it has 8192, and of less than two million 4096. If
+    efficiency. The trial has 16384 samples, spread over the film, which are not part of the image
+    (8192 in renders of less than a million samples, 4096 of less than half a million). A trial of
+    4096 samples precedes it, and replaces it where light paths are worse beyond doubt. If
     light paths reduce the variance to less than 0.4 of its value, the samples before the trial are
     left out of the image.
 
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
     the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
     several lights by a light tree (:monosp:`next_event=tree` of :class:`composed_path`), unless the
-    scene gives :monosp:`pilot_spp`, or it saves or keeps what it learns. Learning, and compiling
-    the kernels that it needs, would take longer than rendering all samples.
+    scene gives a :monosp:`pilot_spp` of 1 or more, or the integrator saves or keeps what it learns.
+    Learning, and compiling the kernels that it needs, would take longer than rendering all samples.
     :monosp:`statistics.learned` then says so. The shorter a render is, the more light paths must
     gain: 1.1 times the efficiency of everything else that was learned, and twice that efficiency in
     renders of half a million samples. With a :monosp:`timeout`, light paths are tried only if there

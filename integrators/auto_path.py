@@ -27,9 +27,9 @@ class AutoPath(WalkIntegrator):
      * - pilot_spp
        - |int|
        - Number of pilot samples per pixel, from which the integrator learns; at most an eighth of
-         all samples (a quarter in short renders). They count towards the image. With 0, it learns
-         nothing and renders as :monosp:`path` does, with a light tree. If it is given, short
-         renders learn too. (Default: 32)
+         all samples up to 262144 pilot samples, a sixteenth beyond, and a quarter in short renders.
+         They count towards the image. With 0, it learns nothing and renders as :monosp:`path` does,
+         with a light tree. (Default: 32; 0 in renders of fewer than 262144 samples)
      * - save_learned, load_learned
        - |string|
        - Names of files. The render saves all that it has learned to :monosp:`save_learned`. With
@@ -60,8 +60,9 @@ class AutoPath(WalkIntegrator):
     shine through glass (camera paths do not find their light).
 
     Renders of fewer than 262144 samples (33554432 on a GPU) learn nothing, and choose among several
-    lights by a light tree, unless the scene gives :monosp:`pilot_spp`, or what is learned is saved
-    or kept: learning, and compiling its kernels, would take longer than rendering all samples.
+    lights by a light tree, unless the scene gives a :monosp:`pilot_spp` of 1 or more, or what is
+    learned is saved or kept: learning, and compiling its kernels, would take longer than rendering
+    all samples.
 
     It is :monosp:`composed_path` with :monosp:`directions=guided`,
     :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,

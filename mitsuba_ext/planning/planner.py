@@ -121,7 +121,7 @@ class Planner(Schedule):
         samples = setting.pixel_count * setting.spp
         self._margin = verdicts.LIGHT_PATHS + LIGHT_PATH_KERNELS / samples
         self._rival = Rival()
-        #: The stage after the trial, while that runs
+        #: The stage after the trials, while these run
         self._next: Stage | None = None
         self._take_up_again: Callable[[], None] | None = None
 
@@ -235,13 +235,18 @@ class Planner(Schedule):
         )
 
     def _stage_after_trial(self) -> Stage:
-        stage, self._next = self._next, None
+        """The stage that follows; another trial, if the small one has not made the choice."""
         trial = self._trial
         alone = {slot: x for slot, x in self.learners.items() if self._finds_all_light(slot)}
         again = {slot: x for slot, x in alone.items() if x.learns_beside_light_paths}
         guides = math.prod(x.efficiency * x.growth for x in again.values())
         others = math.prod(x.efficiency for slot, x in alone.items() if slot not in again)
         self._rival = Rival(self._margin * guides * others, guides)
+        larger = trial.larger(self._rival)
+        if larger is not None:
+            self._trial = larger
+            return self._trial_stage()
+        stage, self._next = self._next, None
         choice = trial.choose(self._rival)
         if choice is None:
             return self._checked_stage(stage)

@@ -51,6 +51,11 @@ class Trial(Learner):
         """The decision of the trial's stage."""
         raise NotImplementedError
 
+    def larger(self, rival: Rival) -> Trial | None:
+        """A trial of more samples that is to make the choice; ``None`` if this one can, because
+        what it tries does not reach ``rival``, or because it is large."""
+        return None
+
     def choose(self, rival: Rival) -> Any | None:
         """The decision of the stages after the trial; ``None`` for ``path``."""
         raise NotImplementedError

@@ -47,6 +47,11 @@ FIRST_MAP_SHARE, FINER_MAP_SHARE = 0.05, 1 / 3
 #: What light paths must gain, besides the time to compile their kernels.
 LIGHT_PATHS = 1.1
 
+#: A small trial ends trying if light paths are worse by more than this number of standard errors.
+#: The least standard error: contrast between pixels of the trial counts as variance, which makes
+#: light paths look worse the smaller a trial is.
+_BEYOND_DOUBT, _LEAST_ERROR = 2.0, 0.05
+
 #: Pilots are left out of the image if later stages have less than this part of their variance: at
 #: equal weights, a quarter of all samples then adds more noise than it removes.
 FAR_LESS = 0.4
@@ -118,3 +123,12 @@ def best(
     other = 1 + int(np.argmax(gains[1:]))
     gains[other] += math.log(guided[other])
     return (other if gains[other] > gains[0] else 0), other
+
+
+def is_beaten(
+    efficiencies: np.ndarray, errors: Sequence[float], rival: float, guided: Sequence[float]
+) -> bool:
+    """Whether the first candidate is the best one beyond doubt. For parameters, see :func:`best`.
+    """
+    doubt = math.exp(_BEYOND_DOUBT * max(errors[0], _LEAST_ERROR))
+    return best(efficiencies, errors, rival / doubt, guided)[0] == 0

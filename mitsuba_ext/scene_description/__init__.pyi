@@ -57,7 +57,7 @@ def adaptive(
 
 def auto(
     *,
-    pilot_spp: int = 32,
+    pilot_spp: int = ...,
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
@@ -79,7 +79,8 @@ def auto(
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most an eighth of all samples (a quarter in short renders). (Default: 32)
+            most an eighth of all samples up to 262144 pilot samples, a sixteenth beyond, and a
+            quarter in short renders. (Default: 32; 0 in renders of fewer than 262144 samples)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)
@@ -99,7 +100,7 @@ def auto(
 
 def auto_path(
     *,
-    pilot_spp: int = 32,
+    pilot_spp: int = ...,
     save_learned: str = "",
     load_learned: str = "",
     keep_learned: bool = False,
@@ -124,7 +125,8 @@ def auto_path(
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
-            most an eighth of all samples (a quarter in short renders). (Default: 32)
+            most an eighth of all samples up to 262144 pilot samples, a sixteenth beyond, and a
+            quarter in short renders. (Default: 32; 0 in renders of fewer than 262144 samples)
         save_learned, load_learned (string): Names of files. (Default: none)
         keep_learned (bool): Whether to keep what is learned for later renders of this process
             (frames, notebooks). (Default: false)

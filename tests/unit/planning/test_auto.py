@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -64,16 +65,41 @@ def test_a_render_that_is_too_short_to_learn_has_a_light_tree() -> None:
         np.testing.assert_array_equal(image, expected)
 
 
-def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> None:
+@pytest.fixture
+def trials(monkeypatch: pytest.MonkeyPatch) -> list[light_paths.LightPathTrial]:
+    """The trials that renders make."""
+    found: list[light_paths.LightPathTrial] = []
+    made = light_paths.LightPathTrial.__init__
+
+    def remembered(trial: light_paths.LightPathTrial, *arguments: Any, **options: Any) -> None:
+        made(trial, *arguments, **options)
+        found.append(trial)
+
+    monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
+    return found
+
+
+def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay(
+    monkeypatch: pytest.MonkeyPatch, trials: list[light_paths.LightPathTrial]
+) -> None:
+    monkeypatch.setattr(light_paths, "_LEAST_SPARSE", 1 << 11)
     integrator = auto()
-    text = learned(load("caustic", width=96, height=54), 64, integrator)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        text = learned(load("caustic", width=96, height=54), 64, integrator)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    small, large = (len(trial.samples) for trial in trials)
+    assert small < 3000 < large
+    kernels = [k for k in kernels if k["operation_count"] > 1000]
+    of_small, of_large = ({k["hash"] for k in kernels if k["size"] == n} for n in (small, large))
+    assert of_small == of_large != set(), "trials of all sizes share their kernels"
     assert "light paths pay: " in text and "guide: " not in text
     effects = integrator.statistics.effects
     assert "directions" not in effects and "next_event" not in effects
-    light_paths = effects["light_paths"]
-    assert light_paths["is_kept"] and light_paths["light_paths"] > 0
-    assert f"({light_paths['variance']:.2f} of the variance" in text
-    assert f"{light_paths['time']:.1f} x the time" in text
+    effect = effects["light_paths"]
+    assert effect["is_kept"] and effect["light_paths"] > 0
+    assert f"({effect['variance']:.2f} of the variance" in text
+    assert f"{effect['time']:.1f} x the time" in text
 
 
 def test_guides_that_paid_are_learned_again_beside_light_paths(
@@ -88,20 +114,15 @@ def test_guides_that_paid_are_learned_again_beside_light_paths(
     assert "roulette" not in integrator.learners
 
 
-def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_coarse_film_predicts_as_the_whole_film(
+    monkeypatch: pytest.MonkeyPatch, trials: list[light_paths.LightPathTrial]
+) -> None:
     scene, estimates = load("cornell_box", width=64, height=36), []
-    trials: list[light_paths.LightPathTrial] = []
-    made = light_paths.LightPathTrial.__init__
-
-    def remembered(trial: light_paths.LightPathTrial, *arguments: Any, **options: Any) -> None:
-        made(trial, *arguments, **options)
-        trials.append(trial)
-
-    monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     for samples in (1 << 10, 1 << 14):
-        monkeypatch.setattr(light_paths, "_SPARSE", samples)
+        for size in ("_SPARSE", "_LEAST_SPARSE"):
+            monkeypatch.setattr(light_paths, size, samples)
         auto().render(scene, spp=32, seed=1)
         estimates.append((trials[-1].estimate.mean.mean(), trials[-1].predicted.variances[:8]))
     (coarse, few), (whole, many) = estimates
@@ -110,9 +131,13 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(few, many, rtol=0.35)
 
 
-def test_light_paths_are_left_out_under_an_open_sky() -> None:
+def test_light_paths_are_left_out_under_an_open_sky_after_a_small_trial(
+    monkeypatch: pytest.MonkeyPatch, trials: list[light_paths.LightPathTrial]
+) -> None:
+    monkeypatch.setattr(light_paths, "_LEAST_SPARSE", 1 << 11)
     scene = stage(light=EMITTERS["constant"](), camera=below_the_lamp())
     assert "light paths do not pay" in learned(scene, 1200)
+    assert [len(trial.samples) < 3000 for trial in trials] == [True]
 
 
 @pytest.mark.slow

@@ -71,8 +71,6 @@ def test_the_defaults_shown_are_those_of_the_plugin(name) -> None:
     for argument in arguments(name):
         if argument.default == "..." or argument.name in _CONDITIONAL:
             continue
-        if (name, argument.name) == ("auto", "pilot_spp"):  # if it is given, short renders learn
-            continue
         given = function(**{argument.name: ast.literal_eval(argument.default)})
         assert str(mi.load_dict(given)) == plain, argument.name
         compared += 1

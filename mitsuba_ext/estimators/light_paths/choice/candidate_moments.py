@@ -45,7 +45,9 @@ class CandidateMoments:
         blocks: int,
         block_of: mi.UInt32 | None,
     ) -> None:
-        self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
+        self._count, self._size = len(candidates), blocks
+        # Opaque: trials of all sizes share their kernel
+        self._pixels, self._blocks = (dr.opaque(mi.UInt32, x) for x in (pixels, blocks))
         self._block_of = block_of
         # MIS weights count ``PHOTONS_PER_DISK`` vertices as one sample of a camera path, but these
         # samples share vertices
@@ -83,21 +85,26 @@ class CandidateMoments:
             inverse, image, is_possible = _split(factors, competing, dr.rcp(mis), is_joined)
             moment = square * inverse
             is_found = active & dr.isfinite(moment)
-            place = 2 * (index * mi.UInt32(self._pixels) + pixel)
-            dr.scatter_add(self._sums, moment, place, is_found)
-            dr.scatter_add(self._sums, brought * image, place + 1, is_found)
+            place = 2 * (index * self._pixels + pixel)
+            add_to(self._sums, moment, place, is_found)
+            add_to(self._sums, brought * image, place + 1, is_found)
             value_bin = dr.select(is_possible, bin_of(moment / brought), BINS - 1)
-            place = index * mi.UInt32(self._blocks) + block
-            place = 2 * (place * mi.UInt32(BINS) + value_bin)
-            dr.scatter_add(self._by_value, brought, place, is_found)
-            dr.scatter_add(self._by_value, moment, place + 1, is_found)
+            place = 2 * ((index * self._blocks + block) * mi.UInt32(BINS) + value_bin)
+            add_to(self._by_value, brought, place, is_found)
+            add_to(self._by_value, moment, place + 1, is_found)
             index += 1
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
         """The sums, [candidate, pixel, 2]; and the sums of light and second moment by the value of
         contributions, [candidate, block, bin, 2]."""
-        by_value = self._by_value.numpy().reshape(self._count, self._blocks, BINS, 2)
-        return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value
+        by_value = self._by_value.numpy().reshape(self._count, self._size, BINS, 2)
+        return self._sums.numpy().reshape(self._count, -1, 2), by_value
+
+
+def add_to(target: mi.Float, value: mi.Float, place: mi.UInt32, active: mi.Bool) -> None:
+    """Adds values to elements of an array. Dr.Jit alone would give each thread a copy of a small
+    array, and compile the size of the array into the kernel."""
+    dr.scatter_add(target, value, place, active, dr.ReduceMode.Direct)
 
 
 def _split(

@@ -43,8 +43,8 @@ _ENOUGH = 1 << 15
 
 #: The largest and the least number of samples of a sparse trial, which has at least two samples of
 #: each pixel of its film; and the largest share of all samples that it may have. A sample of a
-#: trial takes seven to thirty times as long as one of ``path``. (Trials of all sizes kept the same
-#: techniques in twelve scenes; 4096 samples left merging out in water_glass, where it matters.)
+#: trial takes seven to thirty times as long as one of ``path``. (4096 samples left merging out in
+#: water_glass, where it matters; but they tell that light paths do not pay.)
 _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 
 #: The least share of missing light that statistics report.
@@ -139,8 +139,8 @@ class LightPathTrial(Trial):
     Parameters:
         film: The film of the sensor.
         spp: Samples per pixel of the render.
-        is_sparse: Whether one stage of :attr:`samples` is enough, whose image is not kept. If not,
-            there are pilots of all pixels.
+        most: About the number of :attr:`samples` of a sparse trial: a stage of its own, whose image
+            is not kept. 0 for pilots of all pixels.
         has_photons: Whether photons (:class:`PhotonSamples`) are a candidate. They are tried only
             if the render is long enough.
 
@@ -154,13 +154,10 @@ class LightPathTrial(Trial):
     """
 
     def __init__(
-        self, film: mi.Film, spp: int, is_sparse: bool = False, has_photons: bool = False
+        self, film: mi.Film, spp: int, most: int = 0, has_photons: bool = False
     ) -> None:
         extent = film_extent(film)
-        if is_sparse:
-            coarse = CoarseFilm.of(*extent, _trial_samples(extent[0] * extent[1] * spp))
-        else:
-            coarse = CoarseFilm.whole(*extent)
+        coarse = CoarseFilm.of(*extent, most) if most else CoarseFilm.whole(*extent)
         self._film, self._coarse = film, coarse
         corner, self._width = first_pixel(film), coarse.width
         self._moments: PathMoments | None = PathMoments(coarse, corner, extent[0], spp)
@@ -171,6 +168,8 @@ class LightPathTrial(Trial):
             photons=PhotonSamples(coarse, spp) if is_tried else None,
         )  # fmt: skip
         self.samples, self._spp, self._pixel_count = coarse.samples, spp, coarse.pixel_count
+        #: The number of samples of a trial that follows this one
+        self._more = 0
         self.rival = Rival()
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
@@ -208,8 +207,13 @@ class LightPathTrial(Trial):
 
     @classmethod
     def in_own_stage(cls, film: mi.Film, has_photons: bool, spp: int) -> LightPathTrial:
-        """A sparse trial."""
-        return cls(film, spp, True, has_photons)
+        """A sparse trial. Where photons are no candidate, it is a small one at first."""
+        most = _trial_samples(math.prod(film_extent(film)) * spp)
+        if has_photons or most <= _LEAST_SPARSE:
+            return cls(film, spp, most, has_photons)
+        trial = cls(film, spp, _LEAST_SPARSE)
+        trial._more = most
+        return trial
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
@@ -226,7 +230,26 @@ class LightPathTrial(Trial):
             self.choose(Rival())
         return self._choice
 
+    def larger(self, rival: Rival) -> LightPathTrial | None:
+        if self._more == 0:
+            return None
+        self._compare(rival)
+        if verdicts.is_beaten(*self._compared):
+            return None
+        return LightPathTrial(self._film, self._spp, self._more)
+
     def choose(self, rival: Rival) -> LightPathChoice | None:
+        if self._moments is not None:
+            self._compare(rival)
+        self._best, self._best_with_light_paths = verdicts.best(*self._compared)
+        self._choice = LightPathChoice(self.candidates[self._best])
+        if self._best == 0:
+            return None
+        self.check = PredictionCheck(self._film, self._coarse, self.predicted.of_path)
+        return self._choice
+
+    def _compare(self, rival: Rival) -> None:
+        """Predicts errors and time of each candidate."""
         moments, self._moments, self.rival = self._moments, None, rival
         self.candidates, self.estimate = list(moments.candidates), moments.estimate()
         photons = self._choice.photons and self._choice.photons.estimate(self.estimate.mean)
@@ -239,14 +262,9 @@ class LightPathTrial(Trial):
             times.append(cost(PHOTONS, photons.counts))
         self.costs = np.divide(times, times[0])
         guided = [self._of_guides(candidate) for candidate in self.candidates]
-        self._best, self._best_with_light_paths = verdicts.best(
+        self._compared = (
             1 / (predicted.variances * self.costs), predicted.uncertainty, rival.efficiency, guided
-        )
-        self._choice = LightPathChoice(self.candidates[self._best])
-        if self._best == 0:
-            return None
-        self.check = PredictionCheck(self._film, self._coarse, predicted.of_path)
-        return self._choice
+        )  # fmt: skip
 
     def reconsider(self, rival: Rival) -> LightPathChoice | None:
         """``path``, if light paths have more variance than predicted, and less efficiency."""
@@ -321,8 +339,7 @@ class LightPathTrial(Trial):
 
 
 def _trial_samples(samples: int) -> int:
-    """The number of samples of a sparse trial in a render with ``samples`` samples. There are only
-    a few sizes, because kernels contain the size of the coarse film."""
+    """The number of samples of a sparse trial in a render with ``samples`` samples."""
     count = _SPARSE
     while count > max(_LEAST_SPARSE, samples * _MOST):
         count //= 2

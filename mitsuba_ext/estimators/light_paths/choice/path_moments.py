@@ -17,7 +17,7 @@ from ....transport.mis import power_heuristic
 from ....util.arrays import add_own, channel_mean, from_numpy, to_host
 from ..merging.merging import PHOTONS_PER_DISK
 from ..partial_sums import CompetingDensities
-from .candidate_moments import CandidateMoments
+from .candidate_moments import CandidateMoments, add_to
 from .candidates import Available, Candidate, candidates
 from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
@@ -270,8 +270,8 @@ class PathMoments(TechniqueObserver):
         active = active & (brought > 0)
         place = mi.Point2u(position - self._corner)
         pixel = self._place(place.y * self._film_width + place.x, active)
-        dr.scatter_add(self._splats, brought, 2 * pixel, active)
-        dr.scatter_add(self._splats, dr.square(brought), 2 * pixel + 1, active)
+        add_to(self._splats, brought, 2 * pixel, active)
+        add_to(self._splats, dr.square(brought), 2 * pixel + 1, active)
         own = CompetingDensities(competing.by_camera, competing.by_kind + mi.Vector2f(0, 1))
         self._moments.add(brought, mis, own, pixel, active)
 
