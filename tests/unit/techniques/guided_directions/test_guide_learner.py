@@ -214,12 +214,12 @@ def test_regions_follow_the_film_and_the_pilots() -> None:
     for regions in ("tiles", "surfaces"):
         tile = {"tile": 4} if regions == "tiles" else {}
         integrator = mi.load_dict({"type": "pss_guided", "regions": regions, **tile})
-        setting = Setting(lit, camera, 0, 3, 5, 8, pilot_spp=8)
+        setting = Setting(lit, camera, 0, 3, 5, 32, pilot_spp=32)
         learner = integrator.slots["directions"].learner(setting, {})
         assert learner.wants_scout == (regions == "surfaces")
         made.append(learner.make_regions(mi.Point3f(p), mi.Normal3f(up)))
     assert made[0].count == 4 * 3
-    assert made[1].count == SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 64 / 8).count == 9
+    assert made[1].count == SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 256 / 32).count == 9
 
 
 def test_memory_is_bounded_where_no_path_ends() -> None:
