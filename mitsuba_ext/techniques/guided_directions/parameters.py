@@ -17,8 +17,8 @@ from .regions_with_media import RegionsWithMedia
 from .surface_regions import BYTES_PER_REGION, SurfaceRegions
 from .tile_regions import MOST_BOUNCES, TileRegions
 
-#: The fewest pilot samples that a region of surfaces should have. (With 64, trees are no better, and
-#: learning takes up to a fifth longer: docs/results/auto_path.md.)
+#: The fewest pilot samples that a region of surfaces should have. (With 64, trees are no better,
+#: and learning takes up to a fifth longer: docs/results/auto_path.md.)
 _REGION_SAMPLES = 256
 
 
