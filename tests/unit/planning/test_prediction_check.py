@@ -142,7 +142,8 @@ def test_going_back_restores_the_guide_as_it_was() -> None:
         return LightPathChoice(Candidate(1.0, merges=True))
 
     trial = SimpleNamespace(
-        choose=choose, leaves_out=lambda slot, finds_all_light: finds_all_light, check=None,
+        larger=lambda rival: None, choose=choose, check=None,
+        leaves_out=lambda slot, finds_all_light: finds_all_light,
         can_be_guided=False, chosen_variance=0.1, path_variance=None,
         reconsider=lambda rival: competing.append(rival.efficiency), effect=None,
         __str__=lambda: "",
