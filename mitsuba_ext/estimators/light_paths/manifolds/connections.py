@@ -2,8 +2,8 @@
 
 Sources: J. Hanika, M. Droske, L. Fascione, *Manifold Next Event Estimation*, EGSR 2015; T. Zeltner,
 I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering High-Frequency Caustics and
-Glints*, SIGGRAPH 2020. Ours differs in this: one vertex of each path is connected, and the MIS
-weights leave out the probability of finding a chain, so that both sides can compute them.
+Glints*, SIGGRAPH 2020. Ours differs in this: one vertex of each path is connected, and light that
+scattering finds counts the more, the more trials find its chain (:func:`.share_of_scattering`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import mitsuba as mi
 from ....transport.bsdfs import eval_bsdf
 from ....transport.estimator import CameraRays
 from ....transport.heroes import Heroes
-from ....transport.mis import power_heuristic
 from ....transport.numbers import hashed_2d
 from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import SceneQuery
@@ -29,7 +28,10 @@ from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertex, ChosenVertices
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
-from .solver import Found, Queue, Search, Seed, Solver, Target, Tasks, missed
+from .solver import (
+    Found, Queue, Search, Seed, Solver, Target, Tasks, counted, missed, share_of_scattering,
+    trials_within,
+)  # fmt: skip
 
 #: The most surfaces of a chain: in and out of a piece of glass.
 MOST_SURFACES = 2
@@ -51,12 +53,14 @@ class ChainLight:
 
     Attributes:
         L: The radiance that it brings, throughput included, · the probability of finding it.
+        ratio: The density of scattering / the density of lights.
         shadow_count: The number of shadow rays.
         first: The first point on a caster.
         cells: The cells of light path expressions.
     """
 
     L: mi.Spectrum
+    ratio: mi.Float
     shadow_count: mi.UInt32
     first: mi.Point3f
     cells: list[mi.UInt32]
@@ -66,7 +70,7 @@ class ManifoldConnections:
     """Connects vertices to lights through chains of casters.
 
     A chain is one reflection, or one or two refractions. Light that scattering finds through such a
-    chain is weighed against connections (:meth:`weight`).
+    chain counts where connections rarely find it (:meth:`weight`).
 
     Parameters:
         query: How rays intersect the scene.
@@ -123,20 +127,22 @@ class ManifoldConnections:
             dr.gather(Found, found, path, active), *self._chosen(vertices, rays, path, active),
             channels,
         )  # fmt: skip
-        light_of_path, shadow_count, *cells = (
+        light_of_path, ratio, shadow_count, *cells = (
             _of_paths(value, path, active, tasks.count)
-            for value in (brought.L, brought.shadow_count, *brought.cells)
+            for value in (brought.L, brought.ratio, brought.shadow_count, *brought.cells)
         )
         first = _of_paths(brought.first, path, active, tasks.count) if records else None
-        dr.eval(light_of_path, shadow_count, cells, first)
-        trials = self._solver.count(tasks, Queue(dr.max(dr.abs(light_of_path)) > 0), found)
-        L = light_of_path * mi.Float(trials)
+        dr.eval(light_of_path, ratio, shadow_count, cells, first)
+        queue, most = Queue(dr.max(dr.abs(light_of_path)) > 0), trials_within(ratio)
+        dr.eval(most)
+        trials = self._solver.count(tasks, queue, found, most)
+        L = light_of_path * counted(trials, ratio)
         parts = [] if channels is None else channels.parts(cells, L)
         if not records:
             return L, parts, shadow_count, None
         pattern = (found.length << 2) | found.transmits
         weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
-        chains = ChainRecords(chosen.si.p, target.p, first, pattern, weight, trials)
+        chains = ChainRecords(chosen.si.p, target.p, first, pattern, weight)
         return L, parts, shadow_count, chains
 
     def _chosen(
@@ -175,11 +181,10 @@ class ManifoldConnections:
         by_us = light.probability * dr.select(
             light.is_infinite, light.pdf_direction, light.pdf_position
         )
-        by_us *= self._seeds.chance(self._seeds.leaf(start.o, target, active))
-        mis = power_heuristic(by_us, pdf * end.chance * miss.density * cosine)
-        mis = dr.select(light.is_delta_position | light.is_delta_direction, 1, mis)
-        L = chosen.β * value * end.weight * emitted * (miss.density * mis)
-        tested = active & (dr.max(dr.abs(L)) > 0)
+        ratio = pdf * end.chance * miss.density * cosine / by_us
+        ratio = dr.select(light.is_delta_position | light.is_delta_direction, 0, ratio)
+        L = chosen.β * value * end.weight * emitted * miss.density
+        tested = active & (dr.max(dr.abs(L)) > 0) & (ratio < 1)
         visible = tested & ~self._scene.ray_test(_last_ray(end, target), active=tested)
         cells = []
         if channels is not None:
@@ -187,7 +192,8 @@ class ManifoldConnections:
             wo = si.to_local(found.d)
             cells = channels.at_end(at, wo, value, end.symbols(), light.emitter, visible)
         shadow_count = dr.select(tested, mi.UInt32(1), 0)
-        return ChainLight(dr.select(visible, L, 0), shadow_count, end.first, cells)
+        L = dr.select(visible, L, 0)
+        return ChainLight(L, ratio, shadow_count, end.first, cells)
 
     def _emitted(
         self, light: EmittedRay, end: RayState, active: mi.Bool
@@ -241,11 +247,11 @@ class ManifoldConnections:
         self, path: PathState, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> mi.Float:
-        """The MIS weight of light at ``si`` that a path has hit through a chain."""
+        """What counts of light at ``si`` that a path has hit through a chain."""
         h = path.history
-        start = dr.zeros(mi.Ray3f)
-        start.o, start.d, start.maxt = h.o, h.d, dr.largest(mi.Float)
-        start.wavelengths = some_wavelengths()
+        vertex = dr.zeros(mi.SurfaceInteraction3f)
+        vertex.p, vertex.n, vertex.wavelengths = h.p, h.n, some_wavelengths()
+        start = self._query.starts.along(vertex, h.d)
         chain = self._chains.trace(start, h.length, h.transmits, mi.Bool(False), active)
         is_infinite = ~si.is_valid()
         target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
@@ -258,15 +264,18 @@ class ManifoldConnections:
         )
         index = self._emission.index(ds.emitter, active)
         direction *= self._emission.chance(index, active)
-        by_us = self._seeds.chance(self._seeds.leaf(h.o, target, active))
-        by_us *= dr.select(is_infinite, direction, position)
-        by_scattering = h.pdf * miss.density
-        by_scattering *= dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
-        return dr.select(active & miss.is_sound, power_heuristic(by_scattering, by_us), 1)
-
-    def ray(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Ray3f:
-        """The ray that leaves ``si`` in the direction ``d``."""
-        return self._query.starts.along(si, d)
+        by_us = dr.select(is_infinite, direction, position)
+        cosine = dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
+        ratio = h.pdf * miss.density * cosine / by_us
+        active &= miss.is_sound & (ratio < 1)
+        search = Search(
+            vertex, target, _hash_of(h.d), self.most_surfaces(path.depth - h.length - 1),
+            self._seeds.leaf(h.p, target, active),
+        )  # fmt: skip
+        trials = self._solver.find_again(
+            search, Found(h.d, h.length, h.transmits), trials_within(ratio), active
+        )
+        return dr.select(active, share_of_scattering(trials, ratio), 1)
 
     def passes(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether chains pass through this surface."""
@@ -285,6 +294,12 @@ class _HashedNumbers:
 
     def next_1d(self, active=True):
         return self.next_2d(active).x
+
+
+def _hash_of(d: mi.Vector3f) -> mi.UInt32:
+    """A seed for random numbers, from a direction that was sampled."""
+    x, y, z = (dr.reinterpret_array(mi.UInt32, value) for value in d)
+    return mi.sample_tea_32(x ^ z, y)[0]
 
 
 def _of_paths(value: T, path: mi.UInt32, active: mi.Bool, count: int) -> T:

@@ -27,7 +27,8 @@ class History:
     """The casters that a path has met since the last vertex that could be connected.
 
     Attributes:
-        o, d: Origin and direction of the ray that left the vertex.
+        p, n: Position and normal of the vertex.
+        d: The direction in which the ray left it.
         pdf: The density of the direction · the probabilities with which the casters were sampled.
         length: The number of casters; ``_NEVER`` where no connection finds the path.
         transmits: Bit i tells whether caster i has transmitted the ray.
@@ -35,7 +36,8 @@ class History:
         total: The importance of all vertices before.
     """
 
-    o: mi.Point3f
+    p: mi.Point3f
+    n: mi.Normal3f
     d: mi.Vector3f
     pdf: mi.Float
     length: mi.UInt32
@@ -61,7 +63,8 @@ class ManifoldProgram(PathProgram):
 
     def begin(self, ray):
         return History(
-            mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(0), mi.UInt32(_NEVER), mi.UInt32(0),
+            mi.Point3f(ray.o), mi.Normal3f(0), mi.Vector3f(ray.d), mi.Float(0),
+            mi.UInt32(_NEVER), mi.UInt32(0),
             dr.arange(mi.UInt32, self._lanes), mi.Float(0),
         )  # fmt: skip
 
@@ -72,11 +75,11 @@ class ManifoldProgram(PathProgram):
         passes = self._connections.passes(si) & (h.length < MOST_SURFACES)
         # Only chains of refractions have more than one surface
         passes &= (h.length == 0) | (transmitted & (h.transmits != 0))
-        ray = self._connections.ray(si, si.to_world(bs.wo))
         bit = dr.select(transmitted, mi.UInt32(1) << h.length, 0)
         return History(
-            dr.select(is_delta, h.o, ray.o),
-            dr.select(is_delta, h.d, ray.d),
+            dr.select(is_delta, h.p, si.p),
+            dr.select(is_delta, h.n, si.n),
+            dr.select(is_delta, h.d, si.to_world(bs.wo)),
             dr.select(is_delta, h.pdf, 1) * bs.pdf,
             dr.select(is_delta, dr.select(passes, h.length + 1, _NEVER), 0),
             dr.select(is_delta, h.transmits | bit, 0),

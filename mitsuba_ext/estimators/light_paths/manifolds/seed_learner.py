@@ -26,7 +26,6 @@ class ChainRecords:
         first: Its first point on a caster.
         pattern: Length · 4 + the bits of the surfaces that transmit.
         weight: The light that it brings; 0 where there is no chain.
-        trials: The number of further trials until one found it again.
     """
 
     vertex: mi.Point3f
@@ -34,17 +33,16 @@ class ChainRecords:
     first: mi.Point3f
     pattern: mi.UInt32
     weight: mi.Float
-    trials: mi.UInt32
 
     def to_host(self) -> np.ndarray:
-        """The records of chains; shape [chains, 12]."""
+        """The records of chains; shape [chains, 11]."""
         index = dr.compress(self.weight > 0)
         stride = -(-dr.width(index) // _MOST_RECORDS)
         if stride == 0:
-            return np.zeros((0, 12), np.float32)
+            return np.zeros((0, 11), np.float32)
         records = dr.gather(ChainRecords, self, index)
         columns = [*records.vertex, *records.target, *records.first]
-        columns += [mi.Float(records.pattern), mi.Float(records.trials), records.weight]
+        columns += [mi.Float(records.pattern), records.weight]
         return np.stack([np.array(x, np.float32) for x in columns], -1)[::stride]
 
 

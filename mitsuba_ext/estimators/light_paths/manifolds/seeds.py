@@ -24,16 +24,12 @@ _RECORDS_PER_LEAF = 16
 #: The share of trials that begin at a learned seed.
 _SHARE = 0.5
 
-#: The chance before anything was learned.
-_USUAL_CHANCE = 0.1
-
 #: The coordinates of a record: vertex and target.
 _DIMENSIONS = 6
 
 #: The patterns of chains: length · 4 + the bits of the surfaces that transmit.
 _PATTERNS = (4, 5, 11)
 _NO_SPLITS, _NO_SEEDS = np.zeros((0, 2), np.float32), np.zeros((0, _PER_LEAF, 4), np.float32)
-_NO_CHANCES = np.zeros(0, np.float32)
 
 
 class SeedMap:
@@ -44,31 +40,24 @@ class SeedMap:
     the share of trials that begin at its seeds is then 0.
     """
 
-    def __init__(
-        self, splits: np.ndarray = _NO_SPLITS, seeds: np.ndarray = _NO_SEEDS,
-        chances: np.ndarray = _NO_CHANCES,
-    ) -> None:
+    def __init__(self, splits: np.ndarray = _NO_SPLITS, seeds: np.ndarray = _NO_SEEDS) -> None:
         """
         Args:
             splits: For each inner node, the root first, the coordinate and its value; shape
                 [leaves - 1, 2].
             seeds: Shape [leaves, _PER_LEAF, 4]; no leaves before anything was learned.
-            chances: The :meth:`chance` of each leaf.
         """
-        self.splits, self.seeds, self.chances = splits, seeds, chances
+        self.splits, self.seeds = splits, seeds
         nodes = np.zeros((_MOST_LEAVES, 2), np.float32)
         leaves = np.zeros((_MOST_LEAVES, _PER_LEAF, 4), np.float32)
-        of_leaves = np.full(_MOST_LEAVES, _USUAL_CHANCE, np.float32)
         nodes[1 : len(splits) + 1], leaves[: len(seeds)] = splits, seeds
-        of_leaves[: len(chances)] = chances
         self._nodes, self._leaves = from_numpy(mi.Float, nodes), from_numpy(mi.Float, leaves)
-        self._chances = from_numpy(mi.Float, of_leaves)
         self._leaf_count = dr.opaque(mi.UInt32, len(splits) + 1)
         self._share = dr.opaque(mi.Float, _SHARE if len(seeds) else 0.0)
 
     def kernel_state(self) -> tuple:
         """The attributes on which kernels depend (``frozen.py``)."""
-        return self._nodes, self._leaves, self._chances, self._leaf_count, self._share
+        return self._nodes, self._leaves, self._leaf_count, self._share
 
     @dr.syntax
     def leaf(self, p: mi.Point3f, target: Target, active: mi.Bool) -> mi.UInt32:
@@ -103,11 +92,6 @@ class SeedMap:
         words = dr.gather(mi.Vector4f, self._leaves, index)
         return mi.Point3f(words.x, words.y, words.z), mi.UInt32(words.w)
 
-    def chance(self, leaf: mi.UInt32) -> mi.Float:
-        """The probability p of finding a chain of a leaf, for MIS weights: 1 / (2 / p - 1), because
-        the estimate of 1 / p by trials has a variance of its own."""
-        return dr.gather(mi.Float, self._chances, leaf)
-
     # ---- Learning ----
 
     @classmethod
@@ -115,8 +99,8 @@ class SeedMap:
         """The seeds of chains that were found.
 
         Args:
-            records: Vertex, target, first point on a caster, pattern, number of trials, and weight
-                of each chain; shape [chains, 12].
+            records: Vertex, target, first point on a caster, pattern, and weight of each chain;
+                shape [chains, 11].
         """
         depth = int(np.log2(max(1, min(len(records) // _RECORDS_PER_LEAF, _MOST_LEAVES))))
         # Each record becomes seeds in proportion to its weight
@@ -136,12 +120,11 @@ class SeedMap:
             values = np.take_along_axis(along, order[:, half : half + 1], 1)[:, 0]
             splits.append(np.stack([axis, values], -1))
             nodes = nodes.reshape(2 * len(nodes), half, -1)
-        chances = 1 / (2 * nodes[:, :, -1] - 1).mean(1)
-        return cls(np.concatenate(splits).astype(np.float32), nodes[:, :, _DIMENSIONS:-1], chances)
+        return cls(np.concatenate(splits).astype(np.float32), nodes[:, :, _DIMENSIONS:])
 
     def state(self) -> dict[str, np.ndarray]:
         """Its arrays, for :meth:`restored`."""
-        return {"splits": self.splits, "seeds": self.seeds, "chances": self.chances}
+        return {"splits": self.splits, "seeds": self.seeds}
 
     @classmethod
     def restored(cls, state: StoredArrays) -> SeedMap:
@@ -154,4 +137,4 @@ class SeedMap:
         state.require(patterns, "with seeds of unknown patterns")
         splits = state.take("splits", "f", (max(count - 1, 0), 2))
         state.require(bool(np.isin(splits[:, 0], range(_DIMENSIONS)).all()), "with unknown axes")
-        return cls(splits, seeds, state.take("chances", "f", (count,), least=0.0, most=1.0))
+        return cls(splits, seeds)

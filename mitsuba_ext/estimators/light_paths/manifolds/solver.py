@@ -34,6 +34,34 @@ _PATHS_PER_LANE = 32
 _MOST_TRIALS = 1 << 16
 
 
+def trials_within(ratio: mi.Float) -> mi.UInt32:
+    """The number of trials that count (:func:`counted`)."""
+    return mi.UInt32(dr.minimum(dr.rcp(ratio), _MOST_TRIALS))
+
+
+def share_of_scattering(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
+    """The share of a chain that is left to scattering, if so many trials find it again.
+
+    The chain is found with an unknown probability p. The number n of further trials that find it
+    again has the mean 1 / p, and the variance of this estimate grows with 1 / p; where scattering
+    finds the chain, its variance grows with 1 / ``ratio``, where ``ratio`` is the density of
+    scattering / the density of lights. Trial n therefore counts 1 - n · ``ratio``, and those
+    beyond 1 / ``ratio`` do not count. Light that scattering finds counts for the rest, where n is
+    the number of trials that find its chain: both have the mean
+
+        Σ (1 - p)^(n-1) · p · (1 - n ratio) and Σ (1 - p)^(n-1) · p · n ratio,
+
+    and their sum is 1, whatever p is. No other weights that we tried have less variance, and those
+    for a known p have 0.98 to 1 of it."""
+    return dr.minimum(mi.Float(trials) * ratio, 1)
+
+
+def counted(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
+    """What the first ``trials`` trials count: the sum of 1 - :func:`share_of_scattering`."""
+    n = mi.Float(trials)
+    return n - ratio * (0.5 * n * (n + 1))
+
+
 @dataclass
 class Target:
     """Where a chain should end.
@@ -68,7 +96,7 @@ class Miss:
 
 def missed(end: RayState, target: Target) -> Miss:
     """By how far the chain ``end`` misses ``target``."""
-    way = target.p - end.p
+    way = target.p - end.o  # where the ray really starts
     to_target = dr.select(target.is_infinite, mi.Vector3f(target.p), way)
     frame = mi.Frame3f(end.d)
     local = frame.to_local(to_target)
@@ -267,9 +295,11 @@ class Solver:
         return Found(d, found_pattern >> 2, found_pattern & 3)
 
     @dr.syntax
-    def count(self, tasks: Tasks, queue: Queue, found: Found) -> mi.UInt32:
-        """How many further trials it takes to find a chain again, for each path of ``queue``. The
-        mean of this number is 1 / the probability of finding it."""
+    def count(
+        self, tasks: Tasks, queue: Queue, found: Found, most: mi.UInt32
+    ) -> mi.UInt32:
+        """How many further trials it takes to find a chain again, at ``most``, for each path of
+        ``queue``. Without a limit, the mean of this number is 1 / the probability of finding it."""
         result = dr.zeros(mi.UInt32, tasks.count)
         place, going = queue.first()
         walk, trial = _new_walk(), mi.UInt32(1)
@@ -281,14 +311,29 @@ class Solver:
                 dr.gather(mi.UInt32, x, path, solved) for x in (found.length, found.transmits)
             )
             expected = dr.gather(mi.Vector3f, found.d, path, solved)
-            is_same = solved & (pattern == ((length << 2) | transmits))
-            is_same &= dr.squared_norm(d - expected) < _SAME**2
-            dr.scatter(result, trial, path, is_same)
-            finishes = is_same | (ends & (trial >= _MOST_TRIALS))
+            is_same = solved & _are_same(Found(expected, length, transmits), pattern, d)
+            limit = dr.gather(mi.UInt32, most, path, going)
+            finishes = is_same | (ends & (trial >= limit))
+            dr.scatter(result, trial, path, finishes)
             walk.steps = dr.select(ends, 0, walk.steps)
             trial = dr.select(finishes, 1, trial + dr.select(ends, mi.UInt32(1), 0))
             place, going = queue.next(place, finishes)
         return result
+
+    @dr.syntax
+    def find_again(
+        self, search: Search, chain: Found, most: mi.UInt32, active: mi.Bool
+    ) -> mi.UInt32:
+        """How many trials it takes to find ``chain``; ``most`` + 1 if ``most`` do not find it."""
+        walk, trial = _new_walk(), mi.UInt32(1)
+        going = active & (trial <= most)
+        while dr.hint(going, label="trials for scattering"):
+            solved, ends, pattern, d = self._advance(walk, search, trial, going)
+            is_same = solved & _are_same(chain, pattern, d)
+            walk.steps = dr.select(ends, 0, walk.steps)
+            trial += dr.select(ends & ~is_same, mi.UInt32(1), 0)
+            going &= ~is_same & (trial <= most)
+        return trial
 
     def _advance(
         self, walk: NewtonWalk, search: Search, trial: mi.UInt32, active: mi.Bool
@@ -330,6 +375,11 @@ def _new_walk() -> NewtonWalk:
     walk = dr.zeros(NewtonWalk)
     walk.error = mi.Float(dr.inf)
     return walk
+
+
+def _are_same(chain: Found, pattern: mi.UInt32, d: mi.Vector3f) -> mi.Bool:
+    is_same = pattern == ((chain.length << 2) | chain.transmits)
+    return is_same & (dr.squared_norm(d - chain.d) < _SAME**2)
 
 
 def _turned(d: mi.Vector3f, step: mi.Vector2f, share: mi.Float) -> mi.Vector3f:
