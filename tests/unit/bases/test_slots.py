@@ -62,8 +62,8 @@ def test_any_two_words_go_together_or_are_refused_in_a_sentence() -> None:
     # In a variant without wavelengths, the maps of these do not go with anything
     left = {key: sentence for key, sentence in refused.items() if "wavelength" not in key}
     # Connections through casters know the densities of BSDFs only
-    for word in ("focal", "swarm"):
-        sentence = left.pop(("scattering", word, "caustics", "manifold"))
+    for word, another in itertools.product(("focal", "swarm"), ("manifold", "bounded_manifold")):
+        sentence = left.pop(("scattering", word, "caustics", another))
         assert 'leave "scattering" out' in sentence
     learned = ("visibility", "contribution", "triple_product")
     assert set(left) == {("next_event", word, "light_numbers", "swarm") for word in learned}

@@ -3,7 +3,7 @@
 Sources: J. Hanika, M. Droske, L. Fascione, *Manifold Next Event Estimation*, EGSR 2015; T. Zeltner,
 I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering High-Frequency Caustics and
 Glints*, SIGGRAPH 2020. Ours differs in this: one vertex of each path is connected, and light that
-scattering finds counts the more, the more trials find its chain (:func:`.share_of_scattering`).
+scattering finds counts where trials do not find its chain (``shares.py``).
 """
 
 from __future__ import annotations
@@ -28,10 +28,8 @@ from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertex, ChosenVertices
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
-from .solver import (
-    Found, Queue, Search, Seed, Solver, Target, Tasks, counted, missed, share_of_scattering,
-    trials_within,
-)  # fmt: skip
+from .shares import counted, most_trials, share_of_scattering
+from .solver import Found, Queue, Search, Seed, Solver, Target, Tasks, missed
 
 #: The most surfaces of a chain: in and out of a piece of glass.
 MOST_SURFACES = 2
@@ -76,15 +74,18 @@ class ManifoldConnections:
         query: How rays intersect the scene.
         max_depth: Longest path in segments.
         seeds: Learned seeds.
+        most_trials: Trials of a chain end after this number.
     """
 
     def __init__(
-        self, scene: mi.Scene, query: SceneQuery, casters: Casters, max_depth: int, seeds: SeedMap
+        self, scene: mi.Scene, query: SceneQuery, casters: Casters, max_depth: int, seeds: SeedMap,
+        most_trials: int,
     ) -> None:
         self._scene, self._query, self._casters, self._seeds = scene, query, casters, seeds
         self._ctx = Heroes(scene).context()
         self._emission = LightEmission(scene)
         self._max_depth = dr.opaque(mi.UInt32, max_depth)
+        self._most_trials = dr.opaque(mi.UInt32, most_trials)
         self._is_whole = needs_whole_interaction(scene)
         self._chains = Chains(scene, query, casters, self._ctx)
         self._solver = Solver(self._chains, query.starts, self._seed)
@@ -133,9 +134,10 @@ class ManifoldConnections:
         )
         first = _of_paths(brought.first, path, active, tasks.count) if records else None
         dr.eval(light_of_path, ratio, shadow_count, cells, first)
-        queue, most = Queue(dr.max(dr.abs(light_of_path)) > 0), trials_within(ratio)
+        most = most_trials(ratio, self._most_trials)
         dr.eval(most)
-        trials = self._solver.count(tasks, queue, found, most)
+        bright = Queue(dr.max(dr.abs(light_of_path)) > 0)
+        trials = self._solver.count(tasks, bright, found, most)
         L = light_of_path * counted(trials, ratio)
         parts = [] if channels is None else channels.parts(cells, L)
         if not records:
@@ -218,11 +220,15 @@ class ManifoldConnections:
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
 
     def _seed(self, search: Search, trial: mi.UInt32) -> Seed:
-        """Where a trial begins: at a learned seed, towards a random point near a caster, or towards
-        the light."""
+        """Where a trial begins: at a learned seed, towards the light, towards a random point near a
+        caster, or in a random direction on the side of that point. (Close to a caster, few points
+        lead to a chain, but many directions do.)"""
         si, target, seed = search.si, search.target, search.seed
         a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
         d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
+        above = mi.Frame3f(dr.mulsign(mi.Vector3f(si.n), dr.dot(si.n, d)))
+        is_random = self._seeds.is_left_out(e.y)
+        d = dr.select(is_random, above.to_world(mi.warp.square_to_cosine_hemisphere(b)), d)
         transmits, length, is_open = mi.UInt32(0), mi.UInt32(1), mi.Bool(False)
         if self._casters.refract:
             straight = dr.select(
@@ -272,9 +278,9 @@ class ManifoldConnections:
             vertex, target, _hash_of(h.d), self.most_surfaces(path.depth - h.length - 1),
             self._seeds.leaf(h.p, target, active),
         )  # fmt: skip
-        trials = self._solver.find_again(
-            search, Found(h.d, h.length, h.transmits), trials_within(ratio), active
-        )
+        chain = Found(h.d, h.length, h.transmits)
+        most = most_trials(ratio, self._most_trials)
+        trials = self._solver.find_again(search, chain, most, active)
         return dr.select(active, share_of_scattering(trials, ratio), 1)
 
     def passes(self, si: mi.SurfaceInteraction3f) -> mi.Bool:

@@ -52,12 +52,14 @@ class Manifold(Technique):
     #: stores a vertex, a task and its result besides its ray.
     sample_cost, sample_bytes = 4, 288
     pilot_spp = 16
+    #: Trials of a chain end after this number. In pool, one chain in 10^6 needs more.
+    most_trials = 1 << 16
 
     def check_together(self, plugin, slots):
         if "scattering" in slots:
             raise ValueError(
-                f'"{plugin}": the parameter "caustics" is "manifold", which knows the densities of '
-                f'BSDFs only: leave "scattering" out ("direction_map" in "swarm_path")'
+                f'"{plugin}": the parameter "caustics" is "{self.name}", which knows the densities '
+                f'of BSDFs only: leave "scattering" out ("direction_map" in "swarm_path")'
             )
 
     def can_learn(self, scene, spp):
@@ -77,14 +79,16 @@ class Manifold(Technique):
         """What makes the decision from seeds; ``None`` where nothing is connected."""
         scene = setting.scene
         if reason := no_effect(scene, setting.max_depth):
-            what = f'"{setting.plugin}": the parameter "caustics" is "manifold", and has no effect'
-            mi.Log(mi.LogLevel.Warn, f"{what}: {reason}")
+            what = f'"{setting.plugin}": the parameter "caustics" is "{self.name}"'
+            mi.Log(mi.LogLevel.Warn, f"{what}, and has no effect: {reason}")
             return None
         query, depth = scene_query(scene), setting.max_depth
         casters = Casters(casters_of(scene))
 
         def make(seeds: SeedMap, record: Any) -> ManifoldCaustics:
-            connections = ManifoldConnections(scene, query, casters, depth, seeds)
+            connections = ManifoldConnections(
+                scene, query, casters, depth, seeds, self.most_trials
+            )
             return ManifoldCaustics(connections, record)
 
         return make
@@ -108,4 +112,11 @@ def no_effect(scene: mi.Scene, max_depth: int = _SHORTEST) -> str:
     return ""
 
 
-TECHNIQUES = (Manifold,)
+class BoundedManifold(Manifold):
+    """The same with few trials, which makes no pixel very bright, and some too dark."""
+
+    name, words = "bounded_manifold", {"bounded_manifold": {}}
+    most_trials = 64
+
+
+TECHNIQUES = Manifold, BoundedManifold

@@ -77,6 +77,10 @@ class SeedMap:
         """Whether a trial with the random number ``u`` begins at a seed."""
         return u < self._share
 
+    def is_left_out(self, u: mi.Float) -> mi.Bool:
+        """Whether a trial with this number belongs to the second half of the others."""
+        return u >= 0.5 * (1 + self._share)
+
     def seed(self, leaf: mi.UInt32, u: mi.Float, v: mi.Float) -> tuple[mi.Point3f, mi.UInt32]:
         """A seed of a leaf, or of one of the nodes above it: a point on a caster, and length · 4 +
         the bits of the surfaces that transmit.

@@ -30,36 +30,6 @@ _LEAST_SHARE = 1 / 64
 _SAME = 3e-4
 #: How many paths a lane takes: see :class:`Queue`.
 _PATHS_PER_LANE = 32
-#: Trials end here. In pool, one chain in 10^6 needs more.
-_MOST_TRIALS = 1 << 16
-
-
-def trials_within(ratio: mi.Float) -> mi.UInt32:
-    """The number of trials that count (:func:`counted`)."""
-    return mi.UInt32(dr.minimum(dr.rcp(ratio), _MOST_TRIALS))
-
-
-def share_of_scattering(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
-    """The share of a chain that is left to scattering, if so many trials find it again.
-
-    The chain is found with an unknown probability p. The number n of further trials that find it
-    again has the mean 1 / p, and the variance of this estimate grows with 1 / p; where scattering
-    finds the chain, its variance grows with 1 / ``ratio``, where ``ratio`` is the density of
-    scattering / the density of lights. Trial n therefore counts 1 - n · ``ratio``, and those
-    beyond 1 / ``ratio`` do not count. Light that scattering finds counts for the rest, where n is
-    the number of trials that find its chain: both have the mean
-
-        Σ (1 - p)^(n-1) · p · (1 - n ratio) and Σ (1 - p)^(n-1) · p · n ratio,
-
-    and their sum is 1, whatever p is. No other weights that we tried have less variance, and those
-    for a known p have 0.98 to 1 of it."""
-    return dr.minimum(mi.Float(trials) * ratio, 1)
-
-
-def counted(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
-    """What the first ``trials`` trials count: the sum of 1 - :func:`share_of_scattering`."""
-    n = mi.Float(trials)
-    return n - ratio * (0.5 * n * (n + 1))
 
 
 @dataclass

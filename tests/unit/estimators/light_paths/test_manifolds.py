@@ -1,4 +1,4 @@
-"""Connections through casters: derivatives of chains, known answers, and scenes without casters."""
+"""Connections through casters: known answers, and scenes without casters."""
 
 from __future__ import annotations
 
@@ -10,44 +10,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters, casters_of
-from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
+from mitsuba_ext.estimators.light_paths.manifolds.casters import casters_of
 from mitsuba_ext.estimators.light_paths.manifolds.manifold_tracer import ManifoldTracer
 from mitsuba_ext.estimators.light_paths.manifolds.parameters import no_effect
-from mitsuba_ext.estimators.light_paths.manifolds.seeds import SeedMap
-from mitsuba_ext.estimators.light_paths.manifolds.solver import Target
 from mitsuba_ext.rendering.request import Request
-from mitsuba_ext.transport.queries.scene import scene_query
-from mitsuba_ext.util.stored_arrays import DamagedError, StoredArrays
+from tests.support.casters import (
+    GLASS,
+    GREY,
+    MIRROR,
+    camera_at,
+    lamp_above,
+    plane_at,
+    scene_of,
+    wavy_surface,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-GLASS = {"type": "dielectric", "int_ior": 1.5}
-MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
-GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
-
-
-def _plane(height: float, bsdf: dict, size: float = 2.0, down: bool = False) -> dict[str, Any]:
-    to_world = mi.ScalarTransform4f().translate([0, 0, height]).scale(size)
-    if down:
-        to_world = to_world @ mi.ScalarTransform4f().rotate([1, 0, 0], 180)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
-
-
-def _lamp(size: float = 0.3) -> dict[str, Any]:
-    lamp = _plane(2.0, GREY, size, down=True)
-    return {**lamp, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 40.0}}}
-
-
-def _camera(origin: list[float], target: list[float], size: int = 8, fov: float = 30.0) -> Any:
-    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0])
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    return {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
-
-
-def _scene(**parts: Any) -> mi.Scene:
-    sensor = parts.pop("sensor", _camera([0.2, -2.5, 2.5], [0, 0, 0], fov=45.0))
-    return mi.load_dict({"type": "scene", "sensor": sensor, **parts})
 
 
 def _render(scene: mi.Scene, spp: int = 64, seed: int = 0, **parameters: Any) -> np.ndarray:
@@ -55,111 +33,15 @@ def _render(scene: mi.Scene, spp: int = 64, seed: int = 0, **parameters: Any) ->
     return np.array(mi.render(scene, integrator=mi.load_dict(plugin), spp=spp, seed=seed))
 
 
-def _wavy(with_coordinates: bool) -> mi.Mesh:
-    """A curved surface of 72 triangles with interpolated normals."""
-    count = 7
-    x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count), indexing="ij")
-    corners = np.stack([x, y, 0.2 * np.sin(2 * x) * np.cos(y)], -1).reshape(-1, 3)
-    index = np.arange(count**2).reshape(count, count)
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
-    bsdf = mi.load_dict({"type": "dielectric"})
-    props = mi.Properties()
-    props["bsdf"] = bsdf
-    mesh = mi.Mesh("wavy", count**2, len(faces), props=props, has_vertex_normals=True,
-                   has_vertex_texcoords=with_coordinates)  # fmt: skip
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
-    parameters["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-    if with_coordinates:
-        turned = corners[:, :2] @ np.array([[0.3, 0.8], [-2.0, 0.1]])
-        parameters["vertex_texcoords"] = mi.Float(turned.astype(np.float32).ravel())
-    parameters.update()
-    return mesh
-
-
-def _casters() -> dict[str, Any]:
-    metal = {"type": "twosided", "bsdf": {"type": "conductor"}}
-    return {
-        "sphere": {"type": "sphere", "radius": 0.8, "bsdf": GLASS},
-        "metal_sphere": {"type": "sphere", "radius": 0.8, "bsdf": metal},
-        "plane": _plane(0.0, GLASS),
-        "cylinder": {
-            "type": "cylinder", "p0": [-1, 0, 0], "p1": [1, 0, 0], "radius": 0.7, "bsdf": metal,
-        },
-        "mesh": _wavy(False),
-        "mesh_with_coordinates": _wavy(True),
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("transmits", [0, 1, 3])
-@pytest.mark.parametrize("kind", [
-    "sphere", "metal_sphere", "plane", "cylinder", "mesh", "mesh_with_coordinates",
-])  # fmt: skip
-def test_derivatives_of_chains_are_those_of_finite_differences(kind: str, transmits: int) -> None:
-    caster = _casters()[kind]
-    glass = not kind.startswith(("metal", "cylinder"))
-    length = 2 if transmits == 3 else 1
-    if transmits and not glass or length == 2 and kind != "sphere":
-        pytest.skip("no such chain")
-    scene = _scene(caster=caster, lamp=_lamp())
-    casters = Casters(casters_of(scene))
-    chains = Chains(scene, scene_query(scene), casters, mi.BSDFContext())
-    o, d = mi.Point3f(0.3, 0.2, 1.7), dr.normalize(mi.Vector3f(-0.22, -0.05, -1.0))
-    frame, h = mi.Frame3f(d), 2e-3
-
-    def end(s: float, t: float):
-        turned = dr.normalize(d + s * frame.s + t * frame.t)
-        ray = mi.Ray3f(o, turned)
-        return chains.trace(ray, mi.UInt32(length), mi.UInt32(transmits), mi.Bool(False),
-                            mi.Bool(True))  # fmt: skip
-
-    state = end(0, 0)
-    assert state.is_sound[0] and state.length[0] == length
-    for name, plus, minus in (("s", end(h, 0), end(-h, 0)), ("t", end(0, h), end(0, -h))):
-        for what in ("p", "d"):
-            expected = (getattr(plus, what) - getattr(minus, what)) / (2 * h)
-            found = np.array(getattr(state, f"{what}_{name}")).ravel()
-            np.testing.assert_allclose(found, np.array(expected).ravel(), rtol=5e-3, atol=5e-3)
-
-
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("kind", ["sphere", "disk", "rectangle", "cylinder", "ply"])
-def test_tables_of_casters_hold_the_normals_of_mitsuba(kind: str, flip: bool, tmp_path) -> None:
-    rotate = mi.ScalarTransform4f().rotate([1 / 3, 2 / 3, 2 / 3], 40)
-    to_world = mi.ScalarTransform4f().translate([0.2, -0.1, 0.3]).scale(0.8) @ rotate
-    shape = {"type": kind, "to_world": to_world, "flip_normals": flip, "bsdf": GLASS}
-    if kind == "ply":
-        _wavy(True).write_ply(str(tmp_path / "wavy.ply"))
-        shape["filename"] = str(tmp_path / "wavy.ply")
-    scene = _scene(caster=shape)
-    numbers = mi.load_dict({"type": "independent"})
-    numbers.seed(1, 64)
-    origin = mi.Point3f(*(6 * numbers.next_1d() - 3 for _ in range(2)), 4)
-    aim = mi.Point3f(*(numbers.next_1d() - 0.5 for _ in range(3)))
-    ray = mi.Ray3f(origin, dr.normalize(aim - origin))
-    pi = scene.ray_intersect_preliminary(ray)
-    si = pi.compute_surface_interaction(ray)
-    hit = np.array(si.is_valid())
-    assert hit.sum() > 5
-    point, _change = Casters(casters_of(scene)).meet(pi, ray, si.is_valid())
-    for found, expected in ((point.p, si.p), (point.shading_normal, si.sh_frame.n)):
-        found, expected = (np.array(x)[:, hit] for x in (found, expected))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-    along = np.array(abs(dr.dot(point.normal, si.n)))[hit]
-    np.testing.assert_allclose(along, 1, atol=1e-5)
-    np.testing.assert_allclose(np.array(point.eta)[hit], 1.5 / 1.000277, rtol=1e-6)  # in air
-
-
 def test_a_point_light_in_a_mirror_is_a_light_behind_it() -> None:
     """Its image is as bright as the light itself would be at the mirrored place."""
-    camera = _camera([0, 0, 1.5], [0, 0, 0], fov=2.0)
+    camera = camera_at([0, 0, 1.5], [0, 0, 0], fov=2.0)
     point = {"type": "point", "position": [0.3, 0, 0.5], "intensity": {"type": "rgb", "value": 1.0}}
-    floor = _plane(0.0, GREY)
-    scene = _scene(floor=floor, mirror=_plane(2.0, MIRROR, 4.0), light=point, sensor=camera)
-    alone = _render(_scene(floor=floor, light=point, sensor=camera), 16)
+    floor = plane_at(0.0, GREY)
+    scene = scene_of(floor=floor, mirror=plane_at(2.0, MIRROR, 4.0), light=point, sensor=camera)
+    alone = _render(scene_of(floor=floor, light=point, sensor=camera), 16)
     image = {**point, "position": [0.3, 0, 3.5]}
-    expected = alone + _render(_scene(floor=floor, light=image, sensor=camera), 16)
+    expected = alone + _render(scene_of(floor=floor, light=image, sensor=camera), 16)
     # The number of trials is random: the mean of the image is known to 0.5 %
     found = _render(scene, 1024, max_depth=3)
     np.testing.assert_allclose(found.mean(), expected.mean(), rtol=0.02)
@@ -171,81 +53,18 @@ def test_the_sun_through_flat_water_keeps_its_flux(height: float) -> None:
     water = {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0}
     irradiance = {"type": "rgb", "value": 1.0}
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": irradiance}
-    camera = _camera([0.02, 0, 0.1], [0, 0, 0], fov=10.0)
-    scene = _scene(floor=_plane(0.0, GREY), water=_plane(height, water), sun=sun, sensor=camera)
+    camera = camera_at([0.02, 0, 0.1], [0, 0, 0], fov=10.0)
+    floor, surface = plane_at(0.0, GREY), plane_at(height, water)
+    scene = scene_of(floor=floor, water=surface, sun=sun, sensor=camera)
     transmitted = 1 - (0.33 / 2.33) ** 2
     image = _render(scene, 1024, max_depth=3)
     # The number of trials is random: the mean of the image is known to 0.6 %
     np.testing.assert_allclose(image.mean(), 0.5 / np.pi * transmitted, rtol=0.02)
 
 
-def test_searches_may_begin_at_every_part_of_a_thin_caster() -> None:
-    """Its table has no point near some of its parts: 1024 points on a strip 10 000 times as long
-    as wide."""
-    to_world = mi.ScalarTransform4f().scale([10, 0.001, 1])
-    strip = {"type": "rectangle", "to_world": to_world, "bsdf": GLASS}
-    casters = Casters(casters_of(_scene(strip=strip)))
-    numbers = mi.load_dict({"type": "independent"})
-    numbers.seed(1, 1 << 18)
-    v = mi.Vector3f(*(numbers.next_1d() for _ in range(3)))
-    x = np.array(casters.near(numbers.next_1d(), v, numbers.next_1d()).x)
-    counts, _edges = np.histogram(x, 400, (-10, 10))
-    assert (counts > 0).all()
-
-
-def _records(count: int) -> np.ndarray:
-    """Chains from vertices in a cube to one target. Each begins one unit above its vertex; the
-    chains of half of the vertices are twice as bright as the others."""
-    records = np.zeros((count, 11), np.float32)
-    records[:, 0:3] = np.random.default_rng(1).random((count, 3))
-    records[:, 6:9] = records[:, 0:3] + [0, 0, 1]
-    records[:, 9] = 11
-    records[:, 10] = np.where(records[:, 0] < 0.5, 2, 1)
-    return records
-
-
-def _seeds_at(seeds: SeedMap, p: mi.Point3f, height: float) -> mi.Point3f:
-    """Seeds for vertices; ``height`` is the number by which a node of the tree is chosen."""
-    numbers = mi.load_dict({"type": "independent"})
-    numbers.seed(1, dr.width(p))
-    target = Target(mi.Point3f(0), mi.Bool(False))
-    leaf = seeds.leaf(p, target, dr.full(mi.Bool, True, dr.width(p)))
-    first, pattern = seeds.seed(leaf, numbers.next_1d(), mi.Float(height))
-    assert dr.all(pattern == 11)
-    return first - mi.Vector3f(0, 0, 1)
-
-
-def test_seeds_are_those_of_near_vertices_in_proportion_to_their_light() -> None:
-    records = _records(8192)
-    seeds = SeedMap.of(records)
-    p = mi.Point3f(np.ascontiguousarray(records[:, 0:3].T))
-    distance = np.array(dr.norm(_seeds_at(seeds, p, 0.0) - p))
-    assert distance.mean() < 0.12  # 512 leaves; of two random points: 0.66
-    # The root of the tree: the number is the largest one below 1
-    share = (np.array(_seeds_at(seeds, p, 1 - 2.0**-24).x) < 0.5).mean()
-    assert abs(share - 2 / 3) < 0.02
-
-
-def test_few_chains_are_enough_for_seeds() -> None:
-    seeds = SeedMap.of(_records(1))
-    assert len(seeds.seeds) == 1 and not len(seeds.splits)
-
-
-def test_seeds_are_restored() -> None:
-    seeds = SeedMap.of(_records(256))
-    stored = StoredArrays.of(seeds.state())
-    again = SeedMap.restored(stored)
-    for mine, other in zip(seeds.kernel_state(), again.kernel_state()):
-        np.testing.assert_array_equal(np.array(mine), np.array(other))
-    nothing = SeedMap.restored(StoredArrays.of(SeedMap().state()))
-    assert not len(nothing.seeds)
-    with pytest.raises(DamagedError, match="patterns"):
-        SeedMap.restored(StoredArrays.of({**seeds.state(), "seeds": seeds.seeds + 1}))
-
-
 def test_pilots_learn_seeds(tmp_path) -> None:
     """A render that loads what another one has learned begins with its last stage."""
-    scene, file = _scene(**_statistical()["ball"]), str(tmp_path / "learned.npz")
+    scene, file = scene_of(**_statistical()["ball"]), str(tmp_path / "learned.npz")
     integrator = mi.load_dict({
         "type": "composed_path", "max_depth": 6, "caustics": "manifold", "save_learned": file,
     })  # fmt: skip
@@ -262,14 +81,15 @@ def test_pilots_learn_seeds(tmp_path) -> None:
 
 
 def _statistical() -> dict[str, dict[str, Any]]:
-    floor, lamp, sky = _plane(0.0, GREY), _lamp(), {"type": "constant", "radiance": 0.4}
+    floor, lamp, sky = plane_at(0.0, GREY), lamp_above(), {"type": "constant", "radiance": 0.4}
     ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4}
     to_world = mi.ScalarTransform4f().translate([0, 0, 0.7]).scale([1, 1, 0.2])
     box = {"type": "cube", "to_world": to_world}
+    wavy = wavy_surface(True)
     inner = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.1, "bsdf": GREY,
              "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}}  # fmt: skip
     return {
-        "water": {"floor": floor, "water": _plane(0.5, GLASS, 3.0), "lamp": lamp, "sky": sky},
+        "water": {"floor": floor, "water": plane_at(0.5, GLASS, 3.0), "lamp": lamp, "sky": sky},
         "ball": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": lamp},
         "metal_ball": {"floor": floor, "ball": {**ball, "bsdf": MIRROR}, "lamp": lamp},
         # Glass through whose open ends light enters
@@ -278,7 +98,7 @@ def _statistical() -> dict[str, dict[str, Any]]:
             "bsdf": {**GLASS, "specular_transmittance": {"type": "rgb", "value": [0.9, 0.5, 0.2]}},
         }},
         # A mesh without normals beside one with normals
-        "slab": {"floor": floor, "slab": {**box, "bsdf": GLASS}, "wavy": _wavy(True), "lamp": lamp},
+        "slab": {"floor": floor, "slab": {**box, "bsdf": GLASS}, "wavy": wavy, "lamp": lamp},
         "lamp_in_glass": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": inner},
     }  # fmt: skip
 
@@ -287,7 +107,7 @@ def _statistical() -> dict[str, dict[str, Any]]:
 @pytest.mark.parametrize("depth", [3, 4, 6])
 @pytest.mark.parametrize("name", ["water", "ball", "metal_ball", "tube", "slab", "lamp_in_glass"])
 def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
-    scene = _scene(**_statistical()[name])
+    scene = scene_of(**_statistical()[name])
     _compare(scene, {"type": "path", "max_depth": depth}, 4096, depth)
 
 
@@ -302,7 +122,7 @@ def test_points_and_directions_of_light_are_seen_as_bdpt_sees_them(light: dict[s
         to_world = mi.ScalarTransform4f().look_at([0.3, -0.2, 2.5], [0, 0, 0], [0, 1, 0])
         light = {**light, "to_world": to_world}
     ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.4, "bsdf": GLASS}
-    scene = _scene(floor=_plane(0.0, GREY), ball=ball, light=light)
+    scene = scene_of(floor=plane_at(0.0, GREY), ball=ball, light=light)
     # Near focal lines, the variance of such light is infinite: most short renders are 2 % too dark
     _compare(scene, {"type": "bdpt", "max_depth": 4}, 256, 4, 0.03)
 
@@ -344,15 +164,16 @@ def test_without_casters_the_image_is_that_of_scattering(bsdf: dict[str, Any]) -
     if bsdf["type"] == "bumpmap":
         bumps = mi.Bitmap(np.random.default_rng(1).random((4, 4, 1), np.float32))
         bsdf = {**bsdf, "bumps": {"type": "bitmap", "bitmap": bumps, "raw": True}}
-    scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": bsdf}, lamp=_lamp())
+    ball = {"type": "sphere", "bsdf": bsdf}
+    scene = scene_of(floor=plane_at(0.0, GREY), ball=ball, lamp=lamp_above())
     assert not casters_of(scene)
     np.testing.assert_array_equal(_render(scene, 4), _render(scene, 4, caustics="scattered"))
 
 
 @pytest.mark.parametrize("parts, depth", [({}, 6), ({"lamp": True}, 2)])
 def test_without_lights_or_room_for_a_chain_the_image_is_that_of_scattering(parts, depth) -> None:
-    lights = {"lamp": _lamp()} if parts else {}
-    scene = _scene(floor=_plane(0.0, GREY), ball={"type": "sphere", "bsdf": GLASS}, **lights)
+    lights = {"lamp": lamp_above()} if parts else {}
+    scene = scene_of(floor=plane_at(0.0, GREY), ball={"type": "sphere", "bsdf": GLASS}, **lights)
     expected = _render(scene, 4, max_depth=depth, caustics="scattered")
     found = _render(scene, 4, max_depth=depth, pilot_spp=0)
     np.testing.assert_array_equal(found, expected)
@@ -368,16 +189,16 @@ def test_without_lights_or_room_for_a_chain_the_image_is_that_of_scattering(part
 def test_a_warning_says_why_nothing_is_connected(parts, max_depth: int, expected: str) -> None:
     parts = dict(parts)
     if "lamp" in parts:
-        parts["lamp"] = _lamp()
+        parts["lamp"] = lamp_above()
     if parts.pop("moves", False):
         parts["ball"] = {"type": "moving", "translate": [1, 0, 0], "shape": {"type": "sphere"}}
-    scene = _scene(**parts)
+    scene = scene_of(**parts)
     found = no_effect(scene, max_depth)
     assert expected in found and bool(expected) == bool(found)
 
 
 def test_clamps_bound_the_light_of_connections_too() -> None:
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     limits = {"clamp_direct": 1e-3, "clamp_indirect": 1e-3}
     assert _render(scene, 1, **limits).mean(-1).max() < 2.01e-3
 
@@ -388,7 +209,7 @@ def test_light_of_connections_is_in_the_channels_of_its_events() -> None:
     floor = {"type": "blendbsdf", "weight": 0.5, "a": GREY, "b": metal}
     ball = {"type": "sphere", "id": "ball", "center": [0, 0, 0.6], "radius": 0.4, "bsdf": GLASS}
     point = {"type": "point", "position": [0.3, 0.2, 2.0]}
-    scene = _scene(floor=_plane(0.0, floor), ball=ball, light=point)
+    scene = scene_of(floor=plane_at(0.0, floor), ball=ball, light=point)
     aovs = "di:C<.D>.*L,gl:C<.[GS]>.*L,through:C<.[DG]><TS'ball'><TS'ball'>L,back:C<.D><RS>L"
     image = _render(scene, 16, max_depth=4)
     found = _render(scene, 16, max_depth=4, aovs=aovs)
@@ -402,7 +223,7 @@ def test_light_of_connections_is_in_the_channels_of_its_events() -> None:
 
 @pytest.mark.slow
 def test_channels_hold_what_the_channels_of_path_hold() -> None:
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     parameters = {"max_depth": 4, "aovs": "caustics:caustics,others:C.*D.?L"}
     expected, found = (
         np.array([
@@ -417,7 +238,7 @@ def test_channels_hold_what_the_channels_of_path_hold() -> None:
 def test_timed_renders_begin_with_connections() -> None:
     """A first sample by a plain walk would not have the light of points through glass."""
     integrator = mi.load_dict({"type": "composed_path", "caustics": "manifold"})
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     assert integrator.pace_stage(Request(scene, scene.sensors()[0]), 16) is None
 
 
@@ -428,7 +249,7 @@ def test_passes_are_recorded(monkeypatch) -> None:
     traced = []
     trace = ManifoldTracer.trace
     monkeypatch.setattr(ManifoldTracer, "trace", lambda *a: traced.append(1) or trace(*a))
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     for seed in range(3):
         _render(scene, 4, seed=seed)
     assert len(traced) == 2
@@ -436,7 +257,7 @@ def test_passes_are_recorded(monkeypatch) -> None:
 
 def test_a_pass_traces_its_walk_once() -> None:
     """The state of the sampler is found by the same kernel as the samples."""
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history()
         _render(scene, 4, pilot_spp=0)
@@ -446,7 +267,7 @@ def test_a_pass_traces_its_walk_once() -> None:
 
 def test_the_same_seed_gives_the_same_image() -> None:
     gc.collect()  # as above
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     first = _render(scene, 16, seed=3)
     # Up to the order in which two threads add samples to a pixel
     np.testing.assert_allclose(first, _render(scene, 16, seed=3), rtol=1e-5)
@@ -465,13 +286,13 @@ def _error(act: Any) -> str:
 def test_media_are_refused_in_a_sentence() -> None:
     fog = {"type": "homogeneous", "sigma_t": 0.5}
     ball = {"type": "sphere", "bsdf": GLASS, "interior": fog}
-    scene = _scene(floor=_plane(0.0, GREY), ball=ball, lamp=_lamp())
+    scene = scene_of(floor=plane_at(0.0, GREY), ball=ball, lamp=lamp_above())
     message = _error(lambda: _render(scene, 1))
     assert '"caustics" is "manifold"' in message and '"scattered"' in message
 
 
 def test_integrators_that_ask_for_single_samples_are_refused() -> None:
-    scene = _scene(**_statistical()["ball"])
+    scene = scene_of(**_statistical()["ball"])
     nested = {"type": "composed_path", "caustics": "manifold"}
     moment = mi.load_dict({"type": "moment", "nested": nested})
     assert '"caustics" is "manifold"' in _error(lambda: mi.render(scene, integrator=moment, spp=1))
