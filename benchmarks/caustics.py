@@ -1,4 +1,5 @@
-"""Variance and CPU time of a sample with ``caustics=manifold``, beside ``path`` and ``vcm``.
+"""Variance and CPU time of a sample with ``manifold`` and ``bounded_manifold`` (the slot
+``caustics``), beside ``path`` and ``vcm``.
 
     python benchmarks/caustics.py
 
@@ -26,6 +27,7 @@ SCENES = ("pool", "glass_lamp", "caustic", "ring", "water_glass")
 CONTENDERS = {
     "path": ({"type": "path"}, 1.0),
     "manifold": ({"type": "composed_path", "caustics": "manifold"}, 1.0),
+    "bounded": ({"type": "composed_path", "caustics": "bounded_manifold"}, 1.0),
     "vcm": ({"type": "vcm"}, 0.25),
 }
 
@@ -66,7 +68,7 @@ def measured(
 @click.argument("scenes", nargs=-1)
 @click.option("--spp", default=64, help="Samples per pixel of a render.")
 @click.option("--seeds", default=4, help="Renders of each integrator.")
-@click.option("--integrators", default="path,manifold,vcm", help="path, manifold, and others.")
+@click.option("--integrators", default="path,manifold,bounded,vcm", help="The first: the unit.")
 @click.option("--variant", default="llvm_ad_rgb")
 def main(scenes: tuple[str, ...], spp: int, seeds: int, integrators: str, variant: str) -> None:
     """Compares ``caustics=manifold`` with ``path`` and ``vcm``."""

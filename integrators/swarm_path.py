@@ -96,7 +96,8 @@ class SwarmPath(WalkIntegrator):
      * - caustics
        - |string|
        - Whether paths also connect to lights through smooth glass and mirrors
-         (:monosp:`manifold`), as in :class:`composed_path`. (Default: scattered)
+         (:monosp:`manifold`, or :monosp:`bounded_manifold`, which is **biased**), as in
+         :class:`composed_path`. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,

@@ -133,7 +133,8 @@ def auto_path(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors
-            (manifold), as in composed_path. (Default: scattered)
+            (manifold, or bounded_manifold, which is biased), as in composed_path. (Default:
+            scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -755,7 +756,8 @@ def neepp(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors
-            (manifold), as in composed_path. (Default: scattered)
+            (manifold, or bounded_manifold, which is biased), as in composed_path. (Default:
+            scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -875,7 +877,8 @@ def pss_guided(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors
-            (manifold), as in composed_path. (Default: scattered)
+            (manifold, or bounded_manifold, which is biased), as in composed_path. (Default:
+            scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1202,7 +1205,8 @@ def swarm_path(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors
-            (manifold), as in composed_path. (Default: scattered)
+            (manifold, or bounded_manifold, which is biased), as in composed_path. (Default:
+            scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
@@ -1266,7 +1270,8 @@ def two_stage(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors
-            (manifold), as in composed_path. (Default: scattered)
+            (manifold, or bounded_manifold, which is biased), as in composed_path. (Default:
+            scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
