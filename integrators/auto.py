@@ -45,7 +45,7 @@ class Auto(LightPathIntegrator):
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
     guided directions, learned lights, and maps of times, lens points, wavelengths and distances
     (:class:`auto_path`); light paths, their number, the number of connections to them, and merging
-    with them (:class:`vcm`; in participating media, :class:`bdpt` and :class:`sppm`).
+    with them (:class:`vcm`; in participating media, also :class:`sppm`).
 
     .. pluginparameters::
 
@@ -84,10 +84,11 @@ class Auto(LightPathIntegrator):
     directions that paid before are learned again, from samples with light paths, unless vertices
     are merged; together with light paths, a guide is expected to keep the square root of its
     efficiency. The trial has 16384 samples, spread over the film, which are not part of the image
-    (8192 in renders of less than a million samples, 4096 of less than half a million). A trial of
-    4096 samples precedes it, and replaces it where light paths are worse beyond doubt. If
-    light paths reduce the variance to less than 0.4 of its value, the samples before the trial are
-    left out of the image.
+    (8192 in renders of less than a million samples, 4096 of less than half a million; in
+    participating media, where such a sample takes longer, four million and two million). A trial of
+    4096 samples precedes it, except in media, and replaces it where light paths are worse beyond
+    doubt. If light paths reduce the variance to less than 0.4 of its value, the samples before the
+    trial are left out of the image.
 
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
     the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
@@ -112,12 +113,13 @@ class Auto(LightPathIntegrator):
     times the predicted time, exceeds the value without light paths by more than the error of the
     measurement. (Everything else that is learned is tested in each pilot.)
 
-    In scenes with participating media, vertices are not merged beside other techniques. Instead,
-    photons alone are a candidate, which are rendered as in :class:`sppm`. The trial has samples of
-    them in renders of two million samples or more. The photons also show how rarely camera paths
-    find light that no connection reaches: light that enters clear glass, scatters once in a medium
-    there, and leaves the glass. If photons are chosen, nothing else is learned, so that no pilots
-    are left to test this choice.
+    In scenes with participating media, all vertices are merged where any are, as with
+    :monosp:`merging=all` of :class:`vcm`. Merging also shows how rarely camera paths find light
+    that no connection reaches: light that enters clear glass, scatters once in a medium there, and
+    leaves the glass. Photons alone are one candidate more, which are rendered as in :class:`sppm`:
+    they gather light at several points of a ray. The trial has samples of them in renders of two
+    million samples or more. If photons are chosen, nothing else is learned, so that no pilots are
+    left to test this choice.
 
     Light paths are not tried in films for whose pixels a third of the memory does not suffice (two
     million pixels with 16 GiB), if a light cannot emit them, or if light from infinity shines
@@ -188,11 +190,13 @@ class Auto(LightPathIntegrator):
         estimators = super().estimators(request, spp, learning)
         if not _has_photons(request.scene):
             return estimators
-        photons = functools.partial(photon_mapper, self, request, self.merging)
-        return replace(estimators, photons=functools.cache(photons))
+        return replace(estimators, photons=functools.partial(photon_mapper, self, request))
+
+    def merges_all(self, scene):
+        return may_have_media(scene)
 
     def merging_radius(self, request, side, *sums):
-        if not _can_merge(request.scene) or may_have_media(request.scene):
+        if not _can_merge(request.scene):
             return None
         return super().merging_radius(request, side, *sums)
 

@@ -113,8 +113,7 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
                 f'leave it out, or use "bdpt"'
             )
 
-    @property
-    def merges_all(self) -> bool:
+    def merges_all(self, scene):
         return self.where == "all"
 
     def parameters(self):

@@ -17,7 +17,6 @@ import mitsuba as mi
 from ..estimators.light_paths.bidirectional_programs import LightSums
 from ..estimators.light_paths.choice.candidates import Candidate
 from ..estimators.light_paths.choice.light_paths import LightPathChoice, check_shared_rays
-from ..estimators.light_paths.choice.photon_samples import PHOTONS
 from ..estimators.light_paths.choice.technique_images import TechniqueImages
 from ..estimators.light_paths.light_media import outside_of
 from ..estimators.light_paths.light_side import LightSide
@@ -60,8 +59,6 @@ class LightPathIntegrator(WalkIntegrator):
     connections, light_image, sample_direct, technique_images = 1, True, True, ""
     #: Where vertices are merged; ``None`` if they are not.
     merging: MergingParameters | None = None
-    #: Whether all vertices are merged, or only vertices to which light comes from a delta lobe.
-    merges_all = False
     #: What a render uses if no decision says that.
     techniques_by_default = Candidate(1.0, merges=True)
 
@@ -94,6 +91,11 @@ class LightPathIntegrator(WalkIntegrator):
         except NotImplementedError:
             return False
 
+    def merges_all(self, scene: mi.Scene) -> bool:
+        """Whether all vertices are merged, or only vertices to which light comes from a delta
+        lobe."""
+        return False
+
     def estimators(self, request, spp, learning):
         self.techniques = None
         scene, film = request.scene, request.sensor.film()
@@ -107,7 +109,9 @@ class LightPathIntegrator(WalkIntegrator):
             )
         outside = outside_of(self.name, self.query(scene), scene, request.sensor)
         radii = Once(functools.partial(self.merging_radius, request, side, outside))
-        return LightPathEstimators(self, side, radii, self.techniques, outside)
+        return LightPathEstimators(
+            self, side, radii, self.techniques, outside, self.merges_all(scene)
+        )
 
     def merging_radius(
         self,
@@ -139,7 +143,7 @@ class LightPathIntegrator(WalkIntegrator):
             outside=outside, connects=True,
         )  # fmt: skip
         return self.merging.radii_of(
-            request.scene, request.sensor, light_walk, not self.merges_all,
+            request.scene, request.sensor, light_walk, not self.merges_all(request.scene),
             request.samples_before,
         )  # fmt: skip
 
@@ -185,8 +189,9 @@ class LightPathEstimators:
         radii: Within what radii vertices are merged (:meth:`LightPathIntegrator.merging_radius`).
         images: Receives the contributions of all techniques; ``None`` if nothing does.
         outside: See :class:`LightWalk`.
-        photons: Makes the estimator with photons, where vertices are merged by no other one;
-            ``None`` where they are.
+        merges_all: See :meth:`LightPathIntegrator.merges_all`.
+        photons: Makes the estimator with photons alone, with these ``radii``; ``None`` where they
+            are no candidate.
     """
 
     integrator: LightPathIntegrator
@@ -194,15 +199,16 @@ class LightPathEstimators:
     radii: Callable[..., MergingRadii | None]
     images: TechniqueImages | None = None
     outside: mi.MediumPtr | None = None
-    photons: Callable[[], PhotonMapper] | None = None
+    merges_all: bool = False
+    photons: Callable[..., PhotonMapper] | None = None
 
     def __call__(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
         integrator, side = self.integrator, self.side
         always = LightPathChoice(integrator.techniques_by_default, self.images)
         choice: LightPathChoice = decisions.light_paths or always
         techniques = choice.techniques
-        if self.photons is not None and techniques == PHOTONS:
-            return self.photons()
+        if techniques.alone:
+            return self.photons(radii=self.radii())
         are_traced = techniques.light_paths > 0
         next_event = decisions.next_event
         if not integrator.sample_direct:
@@ -224,12 +230,12 @@ class LightPathEstimators:
         tracer = BidirectionalPathTracer(
             walk, side.emission, side.sensor, integrator.connections * techniques.connections,
             decisions.subpath_selection or SubpathSelection(), choice.observer, radii=radii,
-            merges_all=integrator.merges_all, light_paths=techniques.light_paths,
+            merges_all=self.merges_all, light_paths=techniques.light_paths,
             most_lanes=device_of(mi.Float).lanes(sample_bytes), outside=self.outside,
         )  # fmt: skip
         if choice.photons is None:
             return tracer
-        return choice.photons.beside(tracer, self.photons(), side.sensor is not None)
+        return choice.photons.beside(tracer, self.photons(radii=self.radii()))
 
 
 @variant_bound

@@ -168,11 +168,11 @@ class PathLog(Observer):
             JOINED, t - 2, active & _is_light(value), flags=s, rgb=self._rgb(value), weight=mis
         )
 
-    def merged(self, value, mis, competing, active) -> None:
+    def merged(self, value, mis, competing, active, in_medium=False) -> None:
         is_light = active & _is_light(value)
         self._add(next(self._merges), self._depth, is_light, rgb=self._rgb(value), weight=mis)
 
-    def photon(self, value, carried, history, path, active) -> None:
+    def photon(self, value, active) -> None:
         # The vertex may not be known yet: photons of media come before it
         is_light = active & _is_light(value)
         self._add(

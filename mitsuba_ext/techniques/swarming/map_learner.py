@@ -41,6 +41,10 @@ _LEAST_SAMPLES, _EARLY_PART = 64, 0.25
 #: About the number of samples per pixel of the first stage.
 _FIRST_SAMPLES = 0.25
 
+#: The part of the variance that maps leave if the estimate is that nothing is left: such estimates
+#: are differences, mostly noise, and no map has gained more.
+_LEFT = 0.05
+
 
 def tile_edge(samples: float, cells: int, share: float = 1.0) -> int:
     """The edge of a tile in pixels.
@@ -270,7 +274,9 @@ class MapLearner(Learner):
 
     @property
     def efficiency(self) -> float:
-        return 1 / max(1 - self.gain, 1e-3) if self.decision.maps is not None else 1.0
+        if self.decision.maps is None:
+            return 1.0
+        return 1 / (_LEFT if self.gain >= 1 else max(1 - self.gain, 1e-3))
 
     @property
     def effect(self) -> Effect:
@@ -284,5 +290,5 @@ class MapLearner(Learner):
         tiles = self.decision.tiles
         return (
             f"{self.name}: {tiles.count} tiles of {tiles.edge} pixels, "
-            f"{self._memory / 2**20:.1f} MiB, about {self.gain:.0%} less variance"
+            f"{self._memory / 2**20:.1f} MiB, about {min(self.gain, 1):.0%} less variance"
         )

@@ -1,4 +1,4 @@
-"""``auto`` in fog: light paths, connections and photons are candidates, as on surfaces."""
+"""``auto`` in fog: light paths, connections, merging and photons are candidates."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.estimators.light_paths.choice import light_paths, photon_samples
+from mitsuba_ext.estimators.light_paths.choice.candidate_moments import CandidateMoments
 from mitsuba_ext.estimators.light_paths.choice.candidates import Candidate
 from mitsuba_ext.estimators.light_paths.choice.light_paths import LightPathChoice, LightPathTrial
-from mitsuba_ext.estimators.light_paths.choice.photon_samples import (
-    PHOTONS,
-    PhotonEstimate,
-    PhotonSamples,
-)
+from mitsuba_ext.estimators.light_paths.choice.photon_samples import PHOTONS
+from mitsuba_ext.estimators.light_paths.partial_sums import CompetingDensities
 from mitsuba_ext.planning import planner, verdicts
 from mitsuba_ext.planning.prediction_check import PredictionCheck
 from mitsuba_ext.planning.trial import Rival
@@ -35,6 +33,7 @@ def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(photon_samples, "_LEAST", 1 << 14)
     monkeypatch.setattr(light_paths, "_SPARSE", 1 << 11)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    monkeypatch.setattr(light_paths, "_MOST_IN_MEDIA", 1.0)
 
 
 def make(name: str = "auto", **parameters: Any) -> mi.Integrator:
@@ -101,7 +100,7 @@ def test_camera_paths_render_fog_that_they_find_lit() -> None:
     assert not effect["is_kept"] and effect["variance"] * effect["time"] > 1
 
 
-def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_a_lamp_behind_glass(
+def test_merging_tells_the_variance_of_camera_paths_that_hit_a_lamp_behind_glass(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Light scatters once in a ball of smooth glass, and no connection passes its surface."""
@@ -112,36 +111,51 @@ def test_photons_estimate_the_second_moment_of_camera_paths_that_hit_a_lamp_behi
         lamp = {"type": "sphere", "center": [0, 6, 0], "radius": 2.0, "emitter": area(5.0)}
         return mi.load_dict({"type": "scene", "sensor": camera(), "ball": ball, "light": lamp})
 
-    estimates, estimate = [], PhotonSamples.estimate
-
-    def remembered(samples: PhotonSamples, found: np.ndarray) -> PhotonEstimate:
-        estimates.append(estimate(samples, found))
-        return estimates[-1]
-
-    monkeypatch.setattr(PhotonSamples, "estimate", remembered)
-    image(make(max_depth=4), milk(0.8))
+    monkeypatch.setattr(light_paths, "_SPARSE", 1 << 14)
+    trials = use(monkeypatch, Candidate(0.0))
     nested = {"type": "volpath", "max_depth": 4}
-    squares = [
-        image(mi.load_dict({"type": "moment", "nested": nested}), milk(albedo), 2048)[..., -3:]
-        for albedo in (0.8, 0.0)  # the second without scattered light
-    ]
-    expected = np.subtract(*squares).mean(axis=2).sum()
-    assert estimates[0].hidden.sum() == pytest.approx(expected, rel=0.1)
+    found, expected = [], []
+    for albedo in (0.8, 0.0):  # the second without scattered light
+        scene = milk(albedo)
+        image(make(max_depth=4), scene)
+        estimate = trials[-1].estimate
+        found.append(estimate.variances[0].sum() + (estimate.mean**2).sum())
+        moment = mi.load_dict({"type": "moment", "nested": nested})
+        expected.append(image(moment, scene, 1024)[..., -3:].mean(axis=2).sum())
+    assert found[0] - found[1] == pytest.approx(expected[0] - expected[1], rel=0.1)
+
+
+def test_photons_of_a_camera_path_count_together() -> None:
+    """Two photons, which connections find too: these have three quarters of the weight."""
+    merging = [Candidate(1.0, merges=True), Candidate(1.0, connections=0, merges=True)]
+    moments = CandidateMoments([Candidate(0.0), *merging], 1, None, 2, 1, None)
+    lane, competing = mi.UInt32(0, 1), CompetingDensities(mi.Vector2f(0), mi.Vector2f(3, 0))
+    for brought in (1, 2):
+        moments.add(
+            mi.Float(brought, 0), mi.Float(1 / 4), competing, mi.UInt32(0, 0), mi.Bool(True),
+            merging=mi.Float(1), lane=lane,
+        )  # fmt: skip
+    found = moments.merged(2)
+    np.testing.assert_allclose(found[:, 0], [[3, 5], [12, 80]])
+    assert not found[:, 1].any()
 
 
 #: Scenes, and what renders them.
-CHOICES = {
-    "lamp_inside": Candidate(1 / 4, connections=2),
-    "around_the_camera": Candidate(1.0),
-    "grid": Candidate(1 / 16, connections=4),
-    "sky": Candidate(4.0, connections=0),
-}
+CHOICES = [
+    ("lamp_inside", Candidate(1 / 4, connections=2)),
+    ("around_the_camera", Candidate(1.0)),
+    ("around_the_camera", Candidate(1.0, connections=0, merges=True)),
+    ("grid", Candidate(1 / 16, connections=4)),
+    ("sky", Candidate(4.0, connections=0)),
+]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CHOICES)
-def test_no_choice_changes_the_mean(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    use(monkeypatch, CHOICES[name])
+@pytest.mark.parametrize(("name", "choice"), CHOICES)
+def test_no_choice_changes_the_mean(
+    name: str, choice: Candidate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, choice)
     scene = mi.load_dict(SCENES[name](), optimize=False)
     images = batches(scene, make(), 256, range(1, 9))
     expected = batches(scene, make("volpath"), 1024, range(1001, 1009))

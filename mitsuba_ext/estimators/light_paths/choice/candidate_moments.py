@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 
 from ....util.arrays import from_numpy
-from ..merging.merging import PHOTONS_PER_DISK
 from ..partial_sums import CompetingDensities
 from .candidates import Candidate
 from .rare_contributions import BINS, bin_of
@@ -26,13 +25,19 @@ class CandidateMoments:
     and merging are known. For merging at different vertices, only the sum of the squared densities
     is known: the sum of their cubes is computed as if one vertex had all of it. Several connections
     often find the same path (corridor: up to four, whose cubes would be overestimated by half), so
-    only the connection that found the path adds its own term.
+    only the connection that found the path adds its own term. So does merging in scenes with media,
+    where a path may have many vertices that are merged.
+
+    A camera path that scatters in a beam of light meets many photons there, and few camera paths
+    do: the photons of a camera path depend on each other. For each candidate that merges, the sum
+    of what photons bring to a camera path shows this (:meth:`merged`).
 
     Parameters:
         candidates: The candidates. The one without light paths has only the techniques of ``path``.
         pixels: Number of pixels.
-        samples_per_vertex: For each number of light paths that merging candidates have, how many
-            samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
+        merging: c of merging, with which any technique adds the term of merging; ``None`` if
+            merging adds its own term, in scenes with media.
+        lanes: Number of camera paths, if merging adds its own term.
         blocks: Number of blocks of pixels, for each of which there are sums by value.
         block_of: The block of each pixel; ``None`` if each has its own.
     """
@@ -41,30 +46,36 @@ class CandidateMoments:
         self,
         candidates: list[Candidate],
         pixels: int,
-        samples_per_vertex: dict[float, float],
+        merging: float | None,
+        lanes: int,
         blocks: int,
         block_of: mi.UInt32 | None,
     ) -> None:
         self._count, self._size = len(candidates), blocks
         # Opaque: trials of all sizes share their kernel
         self._pixels, self._blocks = (dr.opaque(mi.UInt32, x) for x in (pixels, blocks))
-        self._block_of = block_of
-        # MIS weights count ``PHOTONS_PER_DISK`` vertices as one sample of a camera path, but these
-        # samples share vertices
-        shared = [samples_per_vertex.get(c.light_paths, 1.0) / PHOTONS_PER_DISK for c in candidates]
+        self._block_of, self._merging_is_own = block_of, merging is None
         # Factors of the squared densities of light image, connections, merging; and c of merging
+        # (or, if merging adds its own term, the number of the candidate among those that merge)
+        merges = [c.merges for c in candidates]
+        fourth = np.cumsum(merges) - 1 if merging is None else [merging] * self._count
         self._factors = from_numpy(mi.Float, [
-            (c.light_paths**2, (c.light_paths > 0) * c.connections**2, c.merges, s)
-            for c, s in zip(candidates, shared)
+            (c.light_paths**2, (c.light_paths > 0) * c.connections**2, c.merges, x)
+            for c, x in zip(candidates, fourth)
         ])  # fmt: skip
+        self._lanes = self._merged = None
+        if merging is None:
+            self._lanes = dr.opaque(mi.UInt32, lanes)
+            self._merged = dr.zeros(mi.Float, 2 * sum(merges) * lanes)
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
         self._by_value = dr.zeros(mi.Float, 2 * self._count * blocks * BINS)
-        dr.eval(self._sums, self._by_value)
+        dr.eval(self._sums, self._by_value, self._merged)
 
     @dr.syntax
     def add(
-        self, brought, mis, competing, pixel, active, count: float = 1.0, is_joined: bool = False
-    ) -> None:
+        self, brought, mis, competing, pixel, active, count: float = 1.0, is_joined: bool = False,
+        merging: mi.Float | None = None, lane: mi.UInt32 | None = None,
+    ) -> None:  # fmt: skip
         """Adds a contribution.
 
         Parameters:
@@ -73,6 +84,8 @@ class CandidateMoments:
             pixel: The pixel of the contribution.
             count: The number of such contributions that MIS weights count as one sample.
             is_joined: Whether a connection of a camera path to a light path found it.
+            merging, lane: c of merging, and the lane of the camera path, if merging found it and
+                adds its own term.
         """
         active &= brought > 0
         square = count * dr.square(brought) / mis
@@ -82,7 +95,9 @@ class CandidateMoments:
         index = mi.UInt32(0)
         while index < mi.UInt32(self._count):
             factors = dr.gather(mi.Vector4f, self._factors, index)
-            inverse, image, is_possible = _split(factors, competing, dr.rcp(mis), is_joined)
+            inverse, image, own_share, is_possible = _split(
+                factors, competing, dr.rcp(mis), is_joined, self._merging_is_own, merging
+            )
             moment = square * inverse
             is_found = active & dr.isfinite(moment)
             place = 2 * (index * self._pixels + pixel)
@@ -92,6 +107,12 @@ class CandidateMoments:
             place = 2 * ((index * self._blocks + block) * mi.UInt32(BINS) + value_bin)
             add_to(self._by_value, brought, place, is_found)
             add_to(self._by_value, moment, place + 1, is_found)
+            if dr.hint(merging is not None, mode="scalar"):
+                part = brought / mis * own_share
+                merges = is_found & (factors.z > 0)
+                place = 2 * (mi.UInt32(factors.w) * self._lanes + lane)
+                add_to(self._merged, part, place, merges)
+                add_to(self._merged, dr.square(part), place + 1, merges)
             index += 1
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
@@ -99,6 +120,13 @@ class CandidateMoments:
         contributions, [candidate, block, bin, 2]."""
         by_value = self._by_value.numpy().reshape(self._count, self._size, BINS, 2)
         return self._sums.numpy().reshape(self._count, -1, 2), by_value
+
+    def merged(self, lanes: int) -> np.ndarray:
+        """For each candidate that merges: the sum, and the sum of the squares, of what photons
+        bring to each camera path, [candidate, lane, 2]; of no candidate if merging does not add its
+        own term."""
+        found = np.zeros(0) if self._merged is None else self._merged.numpy()
+        return found.reshape(-1, lanes, 2).astype(np.float64)
 
 
 def add_to(target: mi.Float, value: mi.Float, place: mi.UInt32, active: mi.Bool) -> None:
@@ -108,10 +136,12 @@ def add_to(target: mi.Float, value: mi.Float, place: mi.UInt32, active: mi.Bool)
 
 
 def _split(
-    factors: mi.Vector4f, competing: CompetingDensities, total: mi.Float, is_joined: bool
-) -> tuple[mi.Float, mi.Float, mi.Bool]:
+    factors: mi.Vector4f, competing: CompetingDensities, total: mi.Float, is_joined: bool,
+    merging_is_own: bool, own_merging: mi.Float | None,
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Bool]:  # fmt: skip
     """Σ cᵢ qᵢ³ / (Σ qᵢ²)² in units of the technique that found a path; the MIS weight of the light
-    image; and whether the candidate can find the path. ``total`` is Σ qᵢ² of all techniques."""
+    image, and of merging at the vertex where it was found; and whether the candidate can find the
+    path. ``total`` is Σ qᵢ² of all techniques."""
     connections, image = competing.by_kind
     hit, next_event = (dr.square(q) for q in competing.by_camera)
     merging = dr.maximum(total - (hit + next_event + connections + image), 0)
@@ -130,10 +160,16 @@ def _split(
     if is_joined:
         own = factors.y * inverse
         cubes[3] = own * dr.sqrt(own) * total
-    cubes[-1] *= factors.w
+    if not merging_is_own:
+        cubes[-1] *= factors.w
+    elif own_merging is None:
+        cubes[-1] = mi.Float(0)
+    else:
+        own = factors.z * inverse
+        cubes[-1] = own * dr.sqrt(own) * total * own_merging
     whole = dr.maximum(_sum(shares), 1)
     found = _sum(cubes) / dr.square(whole) * dr.sqrt(inverse)
-    return found, shares[2] / whole, largest > 0
+    return found, shares[2] / whole, factors.z * inverse / whole, largest > 0
 
 
 def _sum(values: list[mi.Float]) -> mi.Float:

@@ -31,13 +31,17 @@ class Candidate:
         connections: Number of connections of each vertex of a camera path to vertices of light
             paths (s, t ≥ 2), in units of the number that the integrator has by default.
         merges: Whether camera paths are merged with light paths.
+        alone: Whether nothing else finds light: photons (:class:`PhotonMapper`).
     """
 
     light_paths: float
     connections: int = 1
     merges: bool = False
+    alone: bool = False
 
     def __str__(self) -> str:
+        if self.alone:
+            return "photons"
         parts = [f"{Fraction(self.light_paths).limit_denominator(64)} for each camera path"]
         if self.connections != 1:
             parts.append(f"{self.connections or 'no'} connections")
@@ -65,11 +69,17 @@ class Available:
     are_shared: bool
     most_lanes: int = 0
 
-    def samples_per_vertex(self, light_paths: float, spp: int, pixels: int) -> float:
-        """:meth:`MergingRadius.samples_per_vertex` in a render of ``spp`` samples per pixel."""
+    @property
+    def merges_in_media(self) -> bool:
+        """Whether vertices in media are merged."""
+        return self.radii is not None and self.radii.ball is not None
+
+    def samples_per_vertex(self, spp: int, pixels: int) -> tuple[float, float]:
+        """:meth:`MergingRadii.samples_per_vertex` in a render of ``spp`` samples per pixel, with
+        as many light paths as candidates with merging have."""
         if self.radii is None:
-            return 1.0
-        passes = 1
+            return 1.0, 1.0
+        (light_paths,), passes = _MERGING_COUNTS, 1
         if self.most_lanes > 0:
             in_pass = max(1, int(self.most_lanes / max(1.0, light_paths)) // pixels)
             passes = -(-spp // in_pass)

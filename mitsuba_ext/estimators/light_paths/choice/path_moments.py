@@ -16,6 +16,7 @@ from ....transport.estimator import CameraRays, Sample
 from ....transport.mis import power_heuristic
 from ....util.arrays import add_own, channel_mean, from_numpy, to_host
 from ..merging.merging import PHOTONS_PER_DISK
+from ..merging.merging_in_media import PHOTONS_PER_SAMPLE
 from ..partial_sums import CompetingDensities
 from .candidate_moments import CandidateMoments, add_to
 from .candidates import Available, Candidate, candidates
@@ -24,6 +25,9 @@ from .technique_observer import TechniqueObserver
 
 #: The approximate largest number of blocks of pixels for which there are sums by value.
 _BLOCKS = 1 << 14
+
+#: The vertices that MIS weights count as one sample of merging, on surfaces and in media.
+_PER_SAMPLE = PHOTONS_PER_DISK, PHOTONS_PER_SAMPLE
 
 
 @dataclass
@@ -146,7 +150,11 @@ class PathMoments(TechniqueObserver):
     def __init__(
         self, coarse: CoarseFilm, corner: tuple[int, int], film_width: int, spp: int
     ) -> None:
-        self._spp, self._shared, self._film_pixels = spp, {}, coarse.pixel_count
+        self._spp, self._film_pixels = spp, coarse.pixel_count
+        #: How many samples of a pixel find the same vertex of a light path, and c of merging, if
+        #: merging adds its own term: on surfaces, and in media
+        self._shared = 1.0, 1.0
+        self._own: list[mi.Float | None] = [None, None]
         self._width, self._pixels = coarse.width, coarse.width * coarse.height
         self._corner, self._film_width = mi.Vector2f(corner), film_width
         self._of_pixel: mi.UInt32 | None = None
@@ -162,11 +170,16 @@ class PathMoments(TechniqueObserver):
         self.counts = Counts()
         # For each pixel: number of samples; sums of the samples' values, of their squares, and of
         # products of what ``path`` finds at different vertices; sums of splats, and of their
-        # squares, of the squares of what was merged, and of connections of first vertices
-        self._sums = np.zeros((8, self._pixels))
+        # squares, and of connections of first vertices
+        self._sums = np.zeros((7, self._pixels))
+        # The squares of what was merged on surfaces, and in media
+        self._squares_merged = np.zeros((2, self._pixels))
         # The second moment and the light image of each candidate
         self._found = np.zeros((0, self._pixels, 2))
         self._by_value = np.zeros((0, self._block_count, BINS, 2))
+        # In scenes with media, for each candidate that merges: what photons bring to camera paths,
+        # and products of the photons of a camera path, [candidate, 2, pixel]
+        self._photons: np.ndarray | None = None
 
     # ---- Observer ----
 
@@ -176,7 +189,7 @@ class PathMoments(TechniqueObserver):
         return (
             self._pixel, self._importance, self._lane, self._path, self._squares, self._merged,
             self._joined, self._shadow_count, self._looked, self._splats, self._moments,
-            self._of_pixel, self._corner, self._film_width,
+            self._of_pixel, self._corner, self._film_width, self._own,
         )  # fmt: skip
 
     def start(self, rays: CameraRays, available: Available) -> None:
@@ -185,12 +198,11 @@ class PathMoments(TechniqueObserver):
             count = len(self.candidates)
             self._found = np.zeros((count, self._pixels, 2), np.float32)
             self._by_value = np.zeros((count, self._block_count, BINS, 2), np.float32)
-            self._shared = {
-                c.light_paths: available.samples_per_vertex(
-                    c.light_paths, self._spp, self._film_pixels
-                )
-                for c in self.candidates[1:] if c.merges
-            }  # fmt: skip
+            self._shared = available.samples_per_vertex(self._spp, self._film_pixels)
+        # MIS weights count these vertices as one sample, but the samples of a pixel share vertices
+        merging = [x / y for x, y in zip(self._shared, _PER_SAMPLE)]
+        in_media = available.merges_in_media
+        self._own = [dr.opaque(mi.Float, x) if in_media else None for x in merging]
         self._pixel, self._importance = self._place(rays.pixel), rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)
@@ -198,11 +210,13 @@ class PathMoments(TechniqueObserver):
         # the terms of this sum
         self._path, self._squares = (dr.zeros(mi.Float, lanes) for _ in range(2))
         # The squares of what was merged, and the connections of the first vertex
-        self._merged, self._joined = (dr.zeros(mi.Float, lanes) for _ in range(2))
+        self._merged = [dr.zeros(mi.Float, lanes) for _ in range(1 + in_media)]
+        self._joined = dr.zeros(mi.Float, lanes)
         self._shadow_count, self._looked = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
         self._splats = dr.zeros(mi.Float, 2 * self._pixels)
         self._moments = CandidateMoments(
-            self.candidates, self._pixels, self._shared, self._block_count, self._block_of
+            self.candidates, self._pixels, None if in_media else merging[0],
+            lanes, self._block_count, self._block_of,
         )
         dr.eval(
             self._path, self._squares, self._merged, self._joined, self._shadow_count,
@@ -250,20 +264,25 @@ class PathMoments(TechniqueObserver):
         is_found = active & (t == 2) & dr.isfinite(mis)
         add_own(self._joined, self._brightness(value), self._lane, is_found)
 
-    def merged(self, value, mis, competing, active) -> None:
-        self._add_other(value, mis, competing, active, PHOTONS_PER_DISK)
+    def merged(self, value, mis, competing, active, in_medium=False) -> None:
+        self._add_other(
+            value, mis, competing, active, _PER_SAMPLE[in_medium], merging=self._own[in_medium]
+        )
         square = dr.square(self._brightness(value))
-        add_own(self._merged, square, self._lane, active & dr.isfinite(square))
+        add_own(self._merged[in_medium], square, self._lane, active & dr.isfinite(square))
 
     def _add_other(
-        self, value, mis, competing, active, count: float = 1.0, is_joined: bool = False
-    ) -> None:
+        self, value, mis, competing, active, count: float = 1.0, is_joined: bool = False,
+        merging: mi.Float | None = None,
+    ) -> None:  # fmt: skip
         """Adds what the camera path in each lane found together with a light path. ``competing``
         holds the technique itself. MIS weights count ``count`` such contributions as one
         sample."""
         brought = self._brightness(value)
         active = active & (brought > 0)
-        self._moments.add(brought, mis, competing, self._pixel, active, count, is_joined)
+        self._moments.add(
+            brought, mis, competing, self._pixel, active, count, is_joined, merging, self._lane
+        )
 
     def splatted(self, s, position, value, mis, competing, active) -> None:
         brought = channel_mean(value)
@@ -288,11 +307,13 @@ class PathMoments(TechniqueObserver):
         brought = self._brightness(camera.L)
         # The whole sample, since the film reads it too
         dr.eval(camera, brought)
-        pixel, values, by_path, squares, merged, joined, *counts = to_host(
-            self._pixel, brought, self._path, self._squares, self._merged, self._joined,
+        pixel, values, by_path, squares, *others = to_host(
+            self._pixel, brought, self._path, self._squares, *self._merged, self._joined,
             self._shadow_count, self._looked, camera.scatter_count, camera.shadow_count,
             whole.scatter_count,
         )  # fmt: skip
+        kinds = len(self._merged)
+        merged, joined, counts = others[:kinds], others[kinds], others[kinds + 1 :]
 
         def per_pixel(values: np.ndarray) -> np.ndarray:
             # NumPy adds in a fixed order: equal seeds give equal sums
@@ -303,9 +324,14 @@ class PathMoments(TechniqueObserver):
         splats = self._splats.numpy().astype(np.float64).reshape(self._pixels, 2)
         self._sums += (
             np.bincount(pixel, minlength=self._pixels), per_pixel(values), per_pixel(values**2),
-            per_pixel(by_path**2 - squares), splats[:, 0], splats[:, 1], per_pixel(merged),
-            per_pixel(joined),
+            per_pixel(by_path**2 - squares), splats[:, 0], splats[:, 1], per_pixel(joined),
         )  # fmt: skip
+        self._squares_merged[: len(merged)] += [per_pixel(x) for x in merged]
+        photons = self._moments.merged(len(pixel))
+        photons = np.array([
+            (per_pixel(x[:, 0]), per_pixel(x[:, 0] ** 2 - x[:, 1])) for x in photons
+        ])  # fmt: skip
+        self._photons = photons if self._photons is None else self._photons + photons
         found, by_value = self._moments.taken()
         self._found += found
         self._by_value += by_value
@@ -323,7 +349,7 @@ class PathMoments(TechniqueObserver):
 
     def estimate(self) -> Estimate:
         """The estimate from all passes."""
-        n, x, x2, own_products, splats, splats2, merged, joined = self._sums
+        n, x, x2, own_products, splats, splats2, joined = self._sums
         n = np.maximum(n, 1)
         # The unbiased estimate: with few samples, the square of the sample mean is too large, by
         # the variance of the mean. With one, the mean is taken over the pixel's neighbours
@@ -331,8 +357,8 @@ class PathMoments(TechniqueObserver):
         of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), alone)
         # Few of all light paths splat to a pixel: the sum of their squares is about their variance.
         # The same holds for merging, except that some samples of a pixel find the same vertex
-        shared = self._shared.get(1.0, 1.0)
-        everything = of_camera + (splats2 + (shared - 1) * merged) / n
+        of_pass = np.subtract(self._shared, 1) @ self._squares_merged
+        everything = of_camera + (splats2 + of_pass) / n
         mean = (x + splats) / n
         squared_mean = np.where(n > 1, mean**2 - everything / n, self._smooth(mean) ** 2)
         moments, images = np.moveaxis(self._found, 2, 0)
@@ -343,14 +369,25 @@ class PathMoments(TechniqueObserver):
         # Products of two connections of the same vertex, and their share of the square of a mean
         of_first = squares_by_neighbours((joined / n).reshape(-1, self._width)).ravel()
         pairs = [1 - 1 / max(c.connections, 1) for c in self.candidates]
+        excess = self._excess_of_photons(n)
         variances = [
-            m / n + (products + share * of_first) * ratio**2 - x**2
-            for m, x, ratio, share in zip(moments, brought, ratios, pairs)
+            m / n + (products - excess[1] + share * of_first) * ratio**2 + e - x**2
+            for m, x, ratio, share, e in zip(moments, brought, ratios, pairs, excess)
         ]
         variances[0] = (moments[0] + own_products) / n - squared_mean
         block = np.arange(self._pixels) if self._block_of is None else self._blocks.of_pixel
         self._by_value /= np.bincount(block, n).astype(np.float32)[:, None, None]
         return Estimate(mean, variances, self._by_value, self._blocks)
+
+    def _excess_of_photons(self, n: np.ndarray) -> list[np.ndarray | float]:
+        """For each candidate: by how much products of what photons bring to a camera path exceed
+        the square of their mean."""
+        excess: list[np.ndarray | float] = [0.0] * len(self.candidates)
+        merging = [i for i, candidate in enumerate(self.candidates) if candidate.merges]
+        for i, (brought, products) in zip(merging, self._photons):
+            squares = squares_by_neighbours((brought / n).reshape(-1, self._width)).ravel()
+            excess[i] = products / n - squares
+        return excess
 
     @property
     def _block_count(self) -> int:

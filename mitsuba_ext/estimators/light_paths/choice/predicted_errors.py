@@ -76,10 +76,10 @@ class PredictedErrors:
         (whole, missed), (trimmed, _) = estimate.errors_of_render(scale, spp, shares)
         variances, never_found = estimate.variances, estimate.never_found()
         if photons is not None:
-            whole, trimmed, variances = map(photons.beside, (whole, trimmed, variances))
-            missed, never_found = (
-                np.append(x + photons.lost, 0) for x in (missed, never_found)
+            whole, trimmed, variances = (
+                [*x, photons.variance] for x in (whole, trimmed, variances)
             )
+            missed, never_found = (np.append(x, 0) for x in (missed, never_found))
         of_image = tuple(float((x[0] * scale**2).mean()) for x in (whole, trimmed))
         long_run, _ = _relative_to_all(variances, scale)
         variances, uncertainty = _relative_to_all(whole, scale)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from ....transport.estimator import CameraRays, Sample
 from ....transport.observer import Observer
-from ....transport.vertex import PathState
 from ..partial_sums import CompetingDensities
 from .candidates import Available
 
@@ -60,18 +57,14 @@ class TechniqueObserver(Observer):
         mis: mi.Float,
         competing: CompetingDensities | None,
         active: mi.Bool,
+        in_medium: bool = False,
     ) -> None:
-        """The camera path in each lane was merged with a light path. This adds ``value`` to its
-        radiance, the MIS weight ``mis`` included."""
+        """The camera path in each lane was merged with a light path, on a surface or
+        ``in_medium``. This adds ``value`` to its radiance, the MIS weight ``mis`` included."""
 
-    def photon(
-        self, value: mi.Spectrum, carried: mi.Spectrum, history: Any, path: PathState,
-        active: mi.Bool,
-    ) -> None:  # fmt: skip
-        """The camera path in each lane, whose state is ``path``, was merged with a vertex of a
-        light path, whose history (:class:`LightProgram`) is given; merging is the only technique.
-        This adds ``value`` to its radiance. ``carried`` is the flux of the light path, times the
-        throughput of the camera path if it goes on along the light path."""
+    def photon(self, value: mi.Spectrum, active: mi.Bool) -> None:
+        """The camera path in each lane was merged with a vertex of a light path; merging is the
+        only technique. This adds ``value`` to its radiance."""
 
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, ``count`` vertices were looked at."""

@@ -285,10 +285,7 @@ class MergedSubpaths(Subpaths):
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:
-                carried = value * vertex.path.β * (arrives / pdf)
-                self._observer.photon(
-                    brought, carried, other.history, vertex.path, active & (pdf > 0)
-                )
+                self._observer.photon(brought, active)
             else:
                 self._observer.merged(brought, mis, competing, active)
         return dr.select(active, value, 0)

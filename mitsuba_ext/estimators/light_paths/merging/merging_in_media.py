@@ -90,7 +90,7 @@ class MergedInMedia(MergedSubpaths):
             if sums.splits:
                 is_first = other.depth == 1, vertex.depth == 0
                 competing = sums.competing_with_merging(*ends, is_first)
-            self._observer.merged(brought, mis, competing, active)
+            self._observer.merged(brought, mis, competing, active, in_medium=True)
         return dr.select(active, value, 0)
 
 
@@ -101,14 +101,19 @@ def widest_ball(scene: mi.Scene, footprint: float) -> float:
 
 
 def suitable_ball(
-    scene: mi.Scene, vertices: VertexCache, kept: Kept, footprint: float, pixels: int
+    scene: mi.Scene,
+    vertices: VertexCache,
+    kept: Kept,
+    footprint: float,
+    pixels: int,
+    free_path: float,
 ) -> float | None:
     """The radius in which a ball holds ``PHOTONS_PER_DISK`` vertices, with one light path per
     pixel: the median over the vertices, because their density near small lamps has no bound.
     ``None`` if there are too few vertices. See :func:`suitable_radius`.
 
     In dense media, light lies within a mean free path of the surface, and a wide ball would reach
-    out of the medium: the median of the mean free paths limits the radius."""
+    out of the medium: ``free_path``, the mean free path, limits the radius."""
     least = 2 * footprint or scene_diagonal(scene) / 500
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
@@ -121,14 +126,16 @@ def suitable_ball(
     per_volume = max(others, 1e-6) / (2 * radius) ** 3
     count = PHOTONS_PER_DISK * PILOT_PATHS / pixels
     found = (count / (4 / 3 * math.pi * per_volume)) ** (1 / 3)
-    return min(found, widest_ball(scene, footprint), _FREE_PATHS * _free_path(vertices, kept))
+    return min(found, widest_ball(scene, footprint), _FREE_PATHS * free_path)
 
 
-def _free_path(vertices: VertexCache, kept: Kept) -> float:
-    """The median of the mean free paths at these vertices, which know their media."""
+def median_free_path(vertices: VertexCache, kept: Kept) -> float:
+    """The median of the mean free paths at these vertices, which know their media; 0 if there are
+    none."""
     index, active = vertices.every()
     active &= kept(index, active)
     vertex = vertices.at(index, active)
     σ = MediumTerms(True).extinction(vertex.si, vertex.medium)
     (found,) = to_host(dr.select(active, σ, -1))
-    return 1 / max(float(np.median(found[found >= 0])), 1e-30)
+    found = found[found >= 0]
+    return 1 / max(float(np.median(found)), 1e-30) if len(found) else 0.0

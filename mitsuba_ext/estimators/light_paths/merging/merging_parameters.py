@@ -18,7 +18,7 @@ from .merging import (
     suitable_radius,
     widest_radius,
 )
-from .merging_in_media import suitable_ball, widest_ball
+from .merging_in_media import median_free_path, suitable_ball, widest_ball
 from .merging_radius import MergingRadii, MergingRadius
 from .shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
 from .vertex_grid import all_of
@@ -100,14 +100,17 @@ class MergingParameters:
         if radius > 0:
             disk = MergingRadius(radius, self.decay, pixels, seen, before, widest)
         if in_media:
-            radius = self.radius_in_media
+            radius, free_path = self.radius_in_media, 0.0
             if radius == 0 and vertices is not None:
                 kept = all_of(vertices.is_in_medium, caustic)
-                radius = suitable_ball(scene, vertices, kept, seen, pixels) or 0
+                free_path = median_free_path(vertices, kept)
+                radius = suitable_ball(scene, vertices, kept, seen, pixels, free_path) or 0
             if not only_caustic:
                 radius = radius or widest_ball(scene, seen)
             if radius > 0:
-                ball = MergingRadius(radius, self.decay, pixels, seen, before, dimensions=3)
+                ball = MergingRadius(
+                    radius, self.decay, pixels, seen, before, dimensions=3, free_path=free_path
+                )
         return MergingRadii(disk, ball) if disk or ball else None
 
 

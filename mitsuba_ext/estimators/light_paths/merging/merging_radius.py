@@ -31,6 +31,7 @@ class MergingRadius:
         widest: The largest radius after one light path per pixel. It shrinks with the number of
             light paths per pixel, as the radius does in passes of one light path per pixel.
         dimensions: 2 for disks, 3 for balls.
+        free_path: The mean free path in a ball, where it is known.
     """
 
     first: float
@@ -40,6 +41,7 @@ class MergingRadius:
     before: int = 0
     widest: float = math.inf
     dimensions: int = 2
+    free_path: float = 0.0
     _passes: int = 0
 
     def of_coarse_film(self, pixel_width: float) -> MergingRadius:
@@ -63,15 +65,20 @@ class MergingRadius:
 
     def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
         """Of the ``spp`` samples that a pixel has in a pass: how many find the same vertex, where
-        any sample does, and thus have the same error. The mean over the first ``passes``.
+        any sample does, and thus have the same error. The mean over the first ``passes``. A sample
+        that passes through a ball finds the vertex if it scatters there.
 
         Parameters:
             light_paths: Number of light paths for each camera path.
         """
         total = 0.0
         for number in range(1, passes + 1):
-            disk = math.pi * self._radius(light_paths * spp, number) ** 2
-            total += max(1.0, spp * disk / (disk + self.footprint**2))
+            radius = self._radius(light_paths * spp, number)
+            disk = math.pi * radius**2
+            finds = disk / (disk + self.footprint**2)
+            if self.free_path > 0:  # 4/3 r is the mean chord of a ball
+                finds *= 1 - math.exp(-4 / 3 * radius / self.free_path)
+            total += max(1.0, spp * finds)
         return total / passes
 
     def _radius(self, per_pixel: float, number: float) -> float:
@@ -106,6 +113,12 @@ class MergingRadii:
             self.ball and self.ball.of_coarse_film(pixel_width),
         )
 
-    def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
-        """:meth:`MergingRadius.samples_per_vertex` of disks, or of balls if there are no disks."""
-        return (self.disk or self.ball).samples_per_vertex(light_paths, spp, passes)
+    def samples_per_vertex(
+        self, light_paths: float, spp: float, passes: int = 1
+    ) -> tuple[float, float]:
+        """:meth:`MergingRadius.samples_per_vertex` of disks and balls; 1 where none are merged."""
+        disk, ball = (
+            radius.samples_per_vertex(light_paths, spp, passes) if radius else 1.0
+            for radius in (self.disk, self.ball)
+        )
+        return disk, ball

@@ -157,8 +157,7 @@ class PhotonsInMedia(MergedSubpaths):
                 if dr.hint(self._channels is not None, mode="scalar"):
                     self._channels.joined_in_medium(path, other.events, value * weight, exists)
                 if dr.hint(self._observer is not None, mode="scalar"):
-                    carried = path.β * σ_s * other.β
-                    self._observer.photon(value * weight, carried, other.history, path, exists)
+                    self._observer.photon(value * weight, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
@@ -175,12 +174,7 @@ class PhotonsInMedia(MergedSubpaths):
             brought = value * vertex.path.β * self._per_vertex
             self._channels.joined_in_medium(vertex.path, other.events, brought, active)
         if self._observer is not None:
-            σ_s, _, _ = vertex.medium.mei.medium.get_scattering_coefficients(
-                vertex.medium.mei, active
-            )
-            brought = value * vertex.path.β * self._per_vertex
-            carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
-            self._observer.photon(brought, carried, other.history, vertex.path, active)
+            self._observer.photon(value * vertex.path.β * self._per_vertex, active)
         return value
 
     def _flux(

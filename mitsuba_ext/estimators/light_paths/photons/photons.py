@@ -16,6 +16,7 @@ from ..light_media import outer_medium
 from ..light_side import light_emission
 from ..light_walk import LightWalk
 from ..merging.merging_parameters import MergingParameters
+from ..merging.merging_radius import MergingRadii
 from .photon_mapper import PhotonMapper
 
 
@@ -35,14 +36,16 @@ class PathIntegrator(Protocol):
 def photon_mapper(
     integrator: PathIntegrator,
     request: Request,
-    merging: MergingParameters,
+    merging: MergingParameters | None = None,
     light_paths: float = 1.0,
+    radii: MergingRadii | None = None,
 ) -> PhotonMapper:
     """The estimator of progressive photon mapping, for a scene that has lights, with the parameters
-    of an integrator. A few light paths measure the radii that are 0.
+    of an integrator.
 
     Parameters:
-        merging, light_paths: See :class:`sppm`.
+        merging, light_paths: See :class:`sppm`. A few light paths measure the radii that are 0.
+        radii: The radii, if they are known; ``merging`` is not used then.
 
     Raises:
         NotImplementedError: A light cannot emit light paths, or light passes through a curve.
@@ -55,8 +58,9 @@ def photon_mapper(
     light_walk = LightWalk(
         emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
     )
-    before = round(request.samples_before * light_paths)
-    radii = merging.radii_of(scene, sensor, light_walk, False, before, True)
+    if radii is None:
+        before = round(request.samples_before * light_paths)
+        radii = merging.radii_of(scene, sensor, light_walk, False, before, True)
     walk = Walk(
         integrator.max_depth, integrator.rr_depth, integrator.hide_emitters,
         next_event=NoConnections(), query=query, channels=integrator.channels,

@@ -12,8 +12,6 @@ from mitsuba_ext.estimators.light_paths.bidirectional_programs import LightSums
 from mitsuba_ext.estimators.light_paths.light_program import LightProgram
 from mitsuba_ext.estimators.light_paths.partial_sums import PartialSums, Sums
 from mitsuba_ext.estimators.light_paths.photons.photon_history import (
-    HiddenLight,
-    HiddenLightProgram,
     PhotonHistory,
     PhotonProgram,
     RegionHistory,
@@ -49,9 +47,6 @@ CASES = {
     "regions": lambda: (
         RegionProgram(SubpathSelection()), *(RegionHistory(mi.UInt32(8)) for _ in range(2))
     ),
-    "hidden lights": lambda: (
-        HiddenLightProgram(), *(HiddenLight(*map(mi.Float, (0, 0, 3))) for _ in range(2))
-    ),
 }  # fmt: skip
 
 
@@ -70,12 +65,11 @@ def test_what_is_stored_is_read_back(name: str) -> None:
             np.testing.assert_array_equal(np.array(getattr(found, key)), np.array(value))
 
 
-@pytest.mark.parametrize("name", ["sums", "photons", "hidden lights"])
+@pytest.mark.parametrize("name", ["sums", "photons"])
 def test_the_first_word_tells_what_came_from_delta_lobes(name: str) -> None:
     of_delta_lobes = {
         "sums": Sums(mi.Float(0), mi.Float(3)),
         "photons": PhotonHistory(mi.Float(0)),
-        "hidden lights": HiddenLight(mi.Float(1), mi.Float(0), mi.Float(3)),
     }
     program, *_ = CASES[name]()
     assert program.stored.words(of_delta_lobes[name])[0] == 0

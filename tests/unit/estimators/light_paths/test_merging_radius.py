@@ -176,3 +176,13 @@ def test_samples_share_vertices_less_in_later_passes() -> None:
     assert 1 < four < one < 8
     wide = MergingRadius(first=1.0, decay=0.5, pixels=100, footprint=1e-3)
     assert wide.samples_per_vertex(1, 8, 4) == pytest.approx(8, rel=1e-3)
+
+
+def test_samples_that_pass_through_a_ball_share_a_vertex_where_they_scatter() -> None:
+    found = [
+        MergingRadius(0.3, 0.75, pixels=100, footprint=1e-3, dimensions=3, free_path=free_path)
+        .samples_per_vertex(1, 64)
+        for free_path in (0.0, 1e-3, 1.0, 1e3)
+    ]  # fmt: skip
+    chord = 4 / 3 * 0.3 / 64 ** (1 / 3)
+    assert found == pytest.approx([64, 64, 64 * (1 - math.exp(-chord)), 1], rel=1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -129,6 +130,14 @@ def test_wrong_maps_only_make_noise(monkeypatch, adversary: str, kind: str) -> N
     expected = batches(scene, plain, 512, [1001, 1002])
     images = batches(scene, swarm(always_use=True, max_depth=depth), 1024, [1, 2])
     assert_same_pixels_on_average(images, expected, 0.08)
+
+
+@pytest.mark.parametrize(("gain", "efficiency"), [(0.5, 2), (0.99, 100), (17.8, 20)])
+def test_a_gain_that_cannot_be_true_promises_little(gain: float, efficiency: float) -> None:
+    """It is the ratio of two differences, which are mostly noise."""
+    learner = map_learner.MapLearner.__new__(map_learner.MapLearner)
+    learner.gain, learner.decision = gain, SimpleNamespace(maps=True)
+    assert learner.efficiency == pytest.approx(efficiency)
 
 
 @pytest.mark.parametrize("spp", [1, 3, 4])
