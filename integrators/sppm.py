@@ -80,11 +80,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
     the same time: otherwise photons could not be merged. Errors of colour and motion blur are then
     the same in all pixels; they fall faster than noise.
 
-    Homogeneous and grid media are rendered. Light is blurred over the ball: it is too dark at the
-    surface of a fog (after 64 samples by up to a sixth in dense media, although the default radius
-    is at most two mean free paths), and too bright behind a wall that is thinner than the radius. A
-    light is taken to lie in the medium on its side of the closest boundary, in the direction of
-    each photon; outside all boundaries, in the medium behind the last boundary that a ray from the
+    Homogeneous and grid media are rendered. Light is blurred over the ball: the outlines of a fog
+    are too dark, and light leaks past the edges of walls that are thinner than the radius. A light
+    is taken to lie in the medium on its side of the closest boundary, in the direction of each
+    photon; outside all boundaries, in the medium behind the last boundary that a ray from the
     sensor crosses. Lights at infinity are refused if that medium is not a vacuum. In camera rays
     through homogeneous media, ``sample_emitters`` is ignored.
 

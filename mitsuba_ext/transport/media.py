@@ -49,6 +49,8 @@ class Inside:
             chromatic media; ``None`` in others, where one colour chooses all distances of a path.
         number: The number of a flight whose distance is chosen at its end, −1 for other flights;
             ``None`` if there are only these.
+        n: The normal of the surface that the path left last, 0 at the sensor; only for paths that
+            pass through media (:attr:`Distances.scatter`), else ``None``.
     """
 
     medium: mi.MediumPtr
@@ -57,6 +59,7 @@ class Inside:
     distances: Any
     shares: mi.UnpolarizedSpectrum | None = None
     number: mi.Float | None = None
+    n: mi.Normal3f | None = None
 
 
 class NoMedia:
@@ -198,7 +201,8 @@ class Media(NoMedia):
         distances = self._distances.begin(rays)
         number = mi.Float(-1) if self._distances.waits else None
         reach = mi.Float(dr.inf)
-        return Inside(mi.MediumPtr(rays.medium), channel, reach, distances, number=number)
+        n = None if self._distances.scatter else dr.zeros(mi.Normal3f)
+        return Inside(mi.MediumPtr(rays.medium), channel, reach, distances, number=number, n=n)
 
     def launch(self, inside, β, sampler, rays, ray, active):
         if not self._distances.scatter:
@@ -383,7 +387,7 @@ class Media(NoMedia):
 
     def cross(self, inside, si, d):
         medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
-        return replace(inside, medium=medium)
+        return replace(inside, medium=medium, n=None if inside.n is None else si.n)
 
     def sees_light(self, path, si, scattered):
         return path.depth != 0

@@ -209,9 +209,10 @@ class BidirectionalPathTracer:
             where = vertices.is_in_medium if kind is MergedInMedia else vertices.is_on_surface
         kept = all_of(where, None if self.merges_all else vertices.is_caustic)
         grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
+        more = {"query": self.walk.query} if kind is MergedInMedia else {}
         return kind(
             vertices, grid, sums, Heroes(scene), self.walk.max_depth, paths, own_lane, others,
-            self.observer, self.walk.channels,
+            self.observer, self.walk.channels, **more,
         )  # fmt: skip
 
 

@@ -9,6 +9,8 @@ Vertex Connection and Merging*, technical report, 2012.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -154,17 +156,37 @@ def disk_radius(
         kept: See :class:`VertexGrid`.
         least: The smallest radius of the disks in which vertices are counted.
     """
+    found = crowded_radius(vertices, kept, least, lambda counts: counts.occupancy)
+    if found is None:
+        return None
+    radius, others = found
+    # Cubes cut squares of two radii out of a surface
+    per_area = others / (4 * radius**2)
+    return math.sqrt(count / (math.pi * per_area))
+
+
+def crowded_radius(
+    vertices: VertexCache,
+    kept: Kept | None,
+    least: float,
+    occupancy: Callable[[VertexCounts], float],
+) -> tuple[float, float] | None:
+    """The first of the radii ``least``, 2 · ``least``, … within which vertices have more than 4
+    others around them (or the last one), and their number. ``None`` if there are too few vertices.
+
+    Parameters:
+        kept: See :class:`VertexGrid`.
+        occupancy: The number of others around a vertex.
+    """
     for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
         counts = VertexCounts(vertices, dr.opaque(mi.Float, radius), kept)
         if counts.count < FEW:
             return None
-        others = counts.occupancy
+        others = occupancy(counts)
         if others > 4:
             break
-    # Cubes cut squares of two radii out of a surface
-    per_area = max(others, 1e-6) / (4 * radius**2)
-    return math.sqrt(count / (math.pi * per_area))
+    return radius, max(others, 1e-6)
 
 
 def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
@@ -224,7 +246,7 @@ class MergedSubpaths(Subpaths):
         if dr.hint(self._others is not None, mode="scalar"):
             total, shadow_count = self._others.gather(scene, sampler, vertex, active)
         merges = active & self._is_merged(vertex)
-        merged = mi.Spectrum(0)
+        flight, merged = self._flight(scene, vertex, merges), mi.Spectrum(0)
         state, si = self._grid.begin(), vertex.si
         group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
         near, looked = [mi.UInt32(0) for _ in range(BATCH)], mi.UInt32(0)
@@ -238,7 +260,8 @@ class MergedSubpaths(Subpaths):
                 searches = merges & (count < BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
-                merged += self._merged(vertex, self._vertices.at(near[0], exists), exists)
+                other = self._vertices.at(near[0], exists)
+                merged += self._merged(vertex, other, flight, exists)
                 near = near[1:] + near[:1]
                 count -= 1
                 exists = count > 0
@@ -251,7 +274,13 @@ class MergedSubpaths(Subpaths):
         """Whether light is gathered at ``vertex``."""
         return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
-    def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
+    def _flight(self, scene: mi.Scene, vertex: Vertex, active: mi.Bool) -> Any:
+        """What :meth:`_merged` needs to know of the flight that ends at ``vertex``."""
+        return None
+
+    def _merged(
+        self, vertex: Vertex, other: LightVertex, flight: Any, active: mi.Bool
+    ) -> mi.Spectrum:
         """BSDF · flux of one light path, with the MIS weight."""
         si, far = vertex.si, other.si
         active = active & (vertex.depth + other.depth + 1 <= self._max_depth)

@@ -146,6 +146,6 @@ class PhotonMapper:
         radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
         grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
         return PhotonsInMedia(
-            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene),
-            self.observer, self.walk.channels,
+            vertices, grid, heroes, max_depth, paths, groups, merged, self.walk.query,
+            may_have_grids(scene), self.observer, self.walk.channels,
         )  # fmt: skip

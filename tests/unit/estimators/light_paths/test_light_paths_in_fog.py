@@ -182,7 +182,7 @@ def test_balls_are_small_in_dense_media() -> None:
         for name in ("bdpt", "vcm", "sppm")
     )
     assert vcm == pytest.approx(bdpt, rel=0.1)
-    assert sppm == pytest.approx(bdpt, rel=0.2)  # it has nothing else near the surface
+    assert sppm == pytest.approx(bdpt, rel=0.1)
 
 
 def test_light_does_not_leak_through_the_surface_of_glass() -> None:
