@@ -8,13 +8,15 @@ learning rates, and get the same processor time (of all cores; compilation and l
 In fog, ``prbvolpath`` stands for ``prb``.
 
 Error: the mean over the parameters, of their difference to the true ones (of their logarithms for
-lamps, roughness and fog), with the best of the learning rates. Speed: how much earlier an
-integrator reaches the larger of its own final error and the final error of ``prb``, as running
-means over a tenth of the steps; below 1 if ``prb`` is the faster one.
+lamps, roughness and fog), with the best of the learning rates. Speed: how much earlier the error
+of an integrator stays at or below a level, which is the larger of its own final error and the final
+error of ``prb``; errors are running means over a tenth of the steps. It is below 1 if ``prb`` is
+the faster one. Where the error of either does not fall, there is no speed (``nan``).
 """
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,10 +153,19 @@ class Recovery:
         self.parameters.update()
         return steps
 
-    def best(self, plugin: dict, seconds: float, rates: tuple[float, ...]) -> list[tuple]:
-        """The run with the best of the learning rates."""
-        runs = [self.run(plugin, seconds, rate, 1) for rate in rates]
-        return min(runs, key=lambda steps: smoothed(steps)[1][-1])
+    def runs(
+        self, plugins: dict[str, dict], seconds: float, rates: tuple[float, ...], seeds: int
+    ) -> dict[str, list[list[tuple]]]:
+        """For each plugin, a run with each of the seeds, with the best of the learning rates.
+        Plugins take turns, because the load of the machine changes."""
+        found = {(name, rate): [] for name in plugins for rate in rates}
+        for seed in range(seeds):
+            for name, rate in found:
+                steps = self.run(plugins[name], seconds, rate, 10**4 * seed)
+                found[name, rate].append(steps)
+        return {
+            name: min((found[name, rate] for rate in rates), key=final_error) for name in plugins
+        }
 
     def _values(self, optimizer: mi.ad.Adam, key: str):
         if not self.task.is_logarithm:
@@ -181,48 +192,66 @@ def smoothed(steps: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
     return times, (sums[width:] - sums[:-width]) / width
 
 
-def described(steps: list[tuple]) -> str:
+def final_error(runs: list[list[tuple]]) -> float:
+    """The mean error at the end."""
+    return float(np.mean([smoothed(steps)[1][-1] for steps in runs]))
+
+
+def described(runs: list[list[tuple]]) -> str:
     """The error at the end, and the number of steps."""
-    return f"{smoothed(steps)[1][-1]:.4f} ({len(steps)} steps)"
+    return f"{final_error(runs):.4f} ({int(np.mean([len(steps) for steps in runs]))} steps)"
 
 
 def speed(ours: list[tuple], theirs: list[tuple]) -> float:
-    """How much earlier ``ours`` reaches the larger of the two final errors."""
+    """How much earlier the error of ``ours`` stays at or below the larger of the two final
+    errors; not a number if that is not below the first error."""
     curves = [smoothed(each) for each in (ours, theirs)]
     level = max(errors[-1] for _, errors in curves)
-    first, second = (times[np.argmax(errors <= level)] for times, errors in curves)
+    if level >= min(errors[0] for _, errors in curves):
+        return math.nan
+    first, second = (times[np.flatnonzero(errors > level)[-1] + 1] for times, errors in curves)
     return float(second / first)
+
+
+def mean_speed(speeds: list[float]) -> float:
+    """The geometric mean of those that are numbers."""
+    known = [each for each in speeds if not math.isnan(each)]
+    return math.exp(np.mean(np.log(known))) if known else math.nan
 
 
 @click.command()
 @click.option("--seconds", default=10.0, show_default=True, help="Of each optimization.")
 @click.option("--size", default=(64, 36), type=(int, int), show_default=True)
 @click.option("--rate", "rates", multiple=True, default=(0.02,), show_default=True, type=float)
+@click.option("--seeds", default=3, show_default=True, help="Optimizations of each integrator.")
 @click.option("--only", default="", help="Tasks whose names contain this.")
 @click.option("--against", "names", multiple=True, default=tuple(INTEGRATORS), show_default=True,
               type=click.Choice(list(INTEGRATORS)))
 def main(
-    seconds: float, size: tuple[int, int], rates: tuple[float, ...], only: str,
+    seconds: float, size: tuple[int, int], rates: tuple[float, ...], seeds: int, only: str,
     names: tuple[str, ...],
 ) -> None:  # fmt: skip
-    """Runs the tasks with each integrator and each learning rate."""
+    """Runs the tasks with each integrator, each learning rate and each seed."""
     mi.set_variant("llvm_ad_rgb")
-    speeds: dict[str, list[float]] = {name: [] for name in names}
+    means: dict[str, list[float]] = {name: [] for name in names}
     for name, task in TASKS.items():
         if only not in name:
             continue
         recovery = Recovery(task, size)
-        base = {"type": "prbvolpath" if task.scene == "fog" else "prb", "max_depth": 6}
-        theirs = recovery.best(base, seconds, rates)
-        print(f"{name}: error {theirs[0][1]:.3f} -> prb {described(theirs)}", end="", flush=True)
+        prb = {"type": "prbvolpath" if task.scene == "fog" else "prb", "max_depth": 6}
+        plugins = {"prb": prb, **{each: INTEGRATORS[each] for each in names}}
+        runs = recovery.runs(plugins, seconds, rates, seeds)
+        start = runs["prb"][0][0][1]
+        print(f"{name}: error {start:.3f} -> prb {described(runs['prb'])}", end="", flush=True)
         for each in names:
-            ours = recovery.best(INTEGRATORS[each], seconds, rates)
-            speeds[each].append(speed(ours, theirs))
-            print(f"; {each} {described(ours)}, speed {speeds[each][-1]:.2f}", end="", flush=True)
-        print()
-    for each, values in speeds.items():
-        mean = np.exp(np.mean(np.log(values)))
-        print(f"{each}: geometric mean {mean:.2f}, least {min(values):.2f}")
+            speeds = [speed(*pair) for pair in zip(runs[each], runs["prb"])]
+            means[each].append(mean_speed(speeds))
+            listed = ", ".join(f"{x:.2f}" for x in speeds)
+            print(f"; {each} {described(runs[each])}, speed {means[each][-1]:.2f} ({listed})",
+                  end="", flush=True)  # fmt: skip
+        print(flush=True)
+    for each, values in means.items():
+        print(f"{each}: geometric mean {mean_speed(values):.2f}, least {np.nanmin(values):.2f}")
 
 
 if __name__ == "__main__":

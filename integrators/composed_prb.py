@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -12,13 +10,16 @@ from mitsuba.ad.integrators import common
 
 from mitsuba_ext.bases.remembering_path import RememberingPath
 from mitsuba_ext.bases.sensitive_path import SensitivePath
-from mitsuba_ext.rendering.camera import film_extent, find_sensor
-from mitsuba_ext.rendering.loss_samples import LossSamples
+from mitsuba_ext.rendering.camera import PassLanes, film_extent, find_sensor
+from mitsuba_ext.rendering.gradient_pass import GradientSamples, ReplayedWalk, propagate
+from mitsuba_ext.rendering.loss_samples import loss_samples
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import (
     RoughBSDFs,
     doubtful_gradients,
     has_gaps,
+    has_roughness,
+    optimized_parameters,
     optimizes_media,
     optimizes_mirrors,
     refuse_geometry,
@@ -26,8 +27,7 @@ from mitsuba_ext.scene.gradients import (
 )
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
-from mitsuba_ext.transport.mirrored_directions import MirroredDirections, PairedNumbers
-from mitsuba_ext.transport.replay import FirstPass, Replay
+from mitsuba_ext.transport.mirrored_directions import PairedNumbers
 
 # Mitsuba executes this module again for each variant, but perhaps not yet for this one
 common = importlib.reload(common)
@@ -72,16 +72,17 @@ class ComposedPRB(common.RBIntegrator):
        - As in :class:`composed_path`. (Default: always)
      * - pilot_spp
        - |int|
-       - As in :class:`composed_path`, but up to three quarters of the samples of the first render.
-         (Default: 32 with guided directions, otherwise 16)
+       - As in :class:`composed_path`, but at most a fifth of the samples of the renders that use
+         what is learned. (Default: 32 with guided directions, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - As in :class:`composed_path`. (Default: none)
      * - learn_every
        - |int|
        - Number of renders of a scene after which the next one learns again, because materials and
-         lights may have changed; 0 to learn only once. The parameter is accepted only if a decision
-         learns. (Default: 16)
+         lights may have changed; 0 to learn only once. The number doubles each time, because what
+         is learned stays good while parameters change little. The parameter is accepted only if a
+         decision learns. (Default: 32)
      * - gradient_samples
        - |string|
        - Samples of the passes for gradients: :monosp:`even`, the same number in each pixel, or
@@ -135,10 +136,10 @@ class ComposedPRB(common.RBIntegrator):
     it would absorb: in empty regions, its gradient may have the wrong sign.) Media within
     instances, which are not accessible, have no such paths.
 
-    The first render of a scene takes pilot samples and learns; later renders, and the passes for
-    gradients, use what it has learned. :monosp:`forget()` makes the next render learn again. If
-    some of several lights are optimized, the passes for gradients learn which light is best for
-    their derivatives.
+    Before the first render of a scene, pilot samples are taken, which are not part of the image.
+    All renders, and the passes for gradients, use what is learned from them. :monosp:`forget()`
+    makes the next render learn again. If some of several lights are optimized, the passes for
+    gradients learn which light is best for their derivatives.
 
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
     Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021; for
@@ -225,52 +226,45 @@ class ComposedPRB(common.RBIntegrator):
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         sensor = find_sensor(scene, sensor)
         with in_turn(self, sensor):
-            self._learn_for(scene, params, sensor, seed, spp)
+            self._learn_for(scene, optimized_parameters(params), sensor, seed, spp)
             return super().render_forward(scene, params, sensor, seed, spp)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         sensor = find_sensor(scene, sensor)
         with in_turn(self, sensor):
-            is_new = self._learn_for(scene, params, sensor, seed, spp)
-            if self._follows_loss:
-                with dr.suspend_grad():
-                    self._follow_loss(scene, grad_in, sensor, seed, spp)
-            else:
-                super().render_backward(scene, params, grad_in, sensor, seed, spp)
+            optimized = optimized_parameters(params)
+            is_new = self._learn_for(scene, optimized, sensor, seed, spp)
+            with dr.suspend_grad():
+                seed = _opaque(seed)
+                sampler, spp = super().prepare(sensor, seed, spp)
+                if self._follows_loss:
+                    samples = loss_samples(sensor, spp, grad_in, int(seed[0]))
+                else:
+                    samples = GradientSamples(PassLanes.of(sensor.film(), spp, 0, None), spp)
+                propagate(
+                    self._replayed(scene), scene, sensor, sampler, seed, samples, grad_in,
+                    [*optimized.values()],
+                )  # fmt: skip
             if is_new:
                 self._tell_of_zeros(params, grad_in)
 
-    def _follow_loss(self, scene, grad_in, sensor, seed, spp) -> None:
-        sampler, spp = self.prepare(sensor, seed, spp)
-        samples = LossSamples(sensor, sampler, spp, grad_in, int(mi.UInt32(seed)[0]))
-        rays, δL = samples.rays, samples.derivatives()
-        *_, gathered = self.sample(
-            dr.ADMode.Primal, scene, sampler.clone(), rays.ray, pixel=rays.pixel
-        )
-        self.sample(
-            dr.ADMode.Backward, scene, sampler, rays.ray, δL=δL, state_in=gathered,
-            pixel=rays.pixel,
-        )  # fmt: skip
-        dr.eval()
-
-    def _learn_for(self, scene, params, sensor, seed, spp) -> bool:
+    def _learn_for(self, scene, optimized, sensor, seed, spp) -> bool:
         """Prepares a pass for gradients. Returns whether it is the first one with respect to these
         parameters."""
-        refuse_geometry(self.name, params)
-        is_new = self._tell_of_doubts(scene, params)
-        learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
+        keys = frozenset(optimized)
+        refuse_geometry(self.name, keys)
+        is_new = self._tell_of_doubts(scene, keys)
+        learned = self._sensitive.prepare(scene, keys, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
         self._flights = optimizes_media(scene)
         self._fills_gaps = has_gaps(scene)
         self._mirrors = optimizes_mirrors(scene)
-        self._rough = RoughBSDFs.of(scene)
+        self._rough = RoughBSDFs.of(scene) if has_roughness(keys) else None
         return is_new
 
-    def _tell_of_doubts(self, scene, params) -> bool:
+    def _tell_of_doubts(self, scene, optimized) -> bool:
         """Warns of gradients that are not those of the image, once for each set of parameters.
         Returns whether the set is new."""
-        items = params.items() if hasattr(params, "items") else ()
-        optimized = frozenset(str(key) for key, value in items if dr.grad_enabled(value))
         if optimized == self._optimized:
             return False
         self._optimized = optimized
@@ -294,34 +288,33 @@ class ComposedPRB(common.RBIntegrator):
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
         self._pixel_count, self._medium = width * height, sensor.get_medium()
+        seed = _opaque(seed)
         sampler, spp = super().prepare(sensor, seed, spp, list(aovs))
         if self._rough is not None:
             sampler = PairedNumbers.begin(sampler, seed)
         return sampler, spp
 
-    def sample(
-        self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, pixel=None, **_others
-    ):
-        if pixel is None:
-            lanes = dr.width(ray)
-            pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
-        rays = CameraRays(ray, pixel, medium=self._medium)
-        walk = self._for_gradients.remembered(scene)
-        if self._rough is not None:
-            directions = MirroredDirections(walk.directions, self._rough)
-            walk = replace(walk, directions=directions)
-        closest = partial(walk.query.closest, scene, coherent=False) if self._fills_gaps else None
+    def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
+        lanes = dr.width(ray)
+        pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
+        rays, walk = CameraRays(ray, pixel, medium=self._medium), self._replayed(scene)
         if mode == dr.ADMode.Primal:
-            first = FirstPass(closest) if self._flights else None
-            sample = replace(walk, replay=first)(scene, sampler, rays, mi.Bool(active))
-            gathered = (sample.L, None)
-            if first is not None:
-                gathered = (first.L, first.detour_L)
+            sample, gathered = walk.first(scene, sampler, rays, active)
             return sample.L, sample.valid, [], gathered
-        replay = Replay(
-            scene, state_in[0], δL if mode == dr.ADMode.Backward else None, self._flights,
-            self._mirrors, state_in[1], closest,
-        )  # fmt: skip
-        sample = replace(walk, replay=replay)(scene, sampler, rays, mi.Bool(active))
+        δL = δL if mode == dr.ADMode.Backward else None
+        sample, replay = walk.again(scene, sampler, rays, state_in, δL, active)
         L = sample.L if mode == dr.ADMode.Backward else replay.derivative
         return L, sample.valid, [], None
+
+    def _replayed(self, scene) -> ReplayedWalk:
+        return ReplayedWalk(
+            self._for_gradients.remembered(scene), self._flights, self._fills_gaps,
+            self._mirrors, self._rough,
+        )  # fmt: skip
+
+
+def _opaque(seed: mi.UInt32 | int) -> mi.UInt32:
+    """A seed that is not a part of kernels."""
+    seed = mi.UInt32(seed)
+    dr.make_opaque(seed)
+    return seed

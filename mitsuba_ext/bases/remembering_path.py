@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from ..planning.planner import LearningPlan, Planner
 from ..planning.technique import Setting, decisions_of
+from ..rendering.request import Request
 from ..rendering.stages import OneStage, ReportedSchedule
 from ..rendering.statistics import RenderStatistics
 from ..scene.mark import SceneMark
@@ -49,8 +52,8 @@ class _Remembered:
 
 @variant_bound
 class RememberingPath(WalkIntegrator):
-    """The primal renders of :class:`composed_prb`. The first render of a scene learns; the next
-    ones use what it has learned, without pilot samples."""
+    """The primal renders of :class:`composed_prb`. Before the first render of a scene, it learns
+    from samples that are not part of an image; the renders use what it has learned."""
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -70,9 +73,10 @@ class RememberingPath(WalkIntegrator):
                 raise ValueError(f'"{self.name}" has no parameter "{key}": leave it out')
         self.learn_every = 0
         if self.can_learn:
-            self.learn_every = self.parameter(props, "learn_every", 16, minimum=0)
+            self.learn_every = self.parameter(props, "learn_every", 32, minimum=0)
         self._remembered: _Remembered | None = None
-        self._renders = 0
+        self._renders, self._interval = 0, self.learn_every
+        self._learned_from: SceneMark | None = None
 
     def parameters(self) -> dict[str, Any]:
         words = {slot: next(iter(SLOTS[slot])) for slot in _SLOTS}
@@ -114,11 +118,39 @@ class RememberingPath(WalkIntegrator):
 
     def learns_within(self, renders: int) -> bool:
         """Whether what it has learned is too old for one of the next ``renders``."""
-        return 0 < self.learn_every < self._renders + renders
+        return 0 < self._interval < self._renders + renders
+
+    def render_once(self, request):
+        if self.can_learn and not self.learned_state.loads(request):
+            if self.is_due or not self._knows(request.scene):
+                self.learn(request)
+        return super().render_once(request)
+
+    def learn(self, request: Request) -> None:
+        """Learns, whatever it knows. Samples are at most a quarter of the samples of the renders
+        that will use what it learns.
+
+        Parameters:
+            request: One of these renders.
+        """
+        self.forget()
+        spp = request.spp or request.sensor.sampler().sample_count()
+        is_again = self._learned_from is not None and self._learned_from.is_of(request.scene)
+        self._interval = 2 * self._interval if is_again else self.learn_every
+        self._learned_from = SceneMark(request.scene)
+        # Pilots are three quarters of the samples
+        samples = min(4 * self._pilot_spp // 3 + 1, spp * (self._interval or 32) // 4)
+        # Not the random numbers of the render that uses what is learned
+        seed = int((mi.UInt32(request.seed) + 0x9E3779B9)[0])
+        of_pilots = replace(
+            request, seed=seed, spp=max(4, samples), develop=False, progress=None, watch=None
+        )
+        if self.plan_learning(of_pilots, of_pilots.spp).pilots:
+            with dr.suspend_grad():
+                super().render_once(of_pilots)
+        self._renders = 0
 
     def plan_learning(self, request, spp, kernels=math.inf):
-        if self.is_due:
-            self.forget()
         if self._knows(request.scene):
             return LearningPlan()
         return super().plan_learning(request, 3 * spp, kernels)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from ..planning.planner import Estimators, LearningPlan
@@ -39,24 +38,24 @@ class SensitivePath(RememberingPath):
         self._optimized: Optimized | None = None
 
     def prepare(
-        self, scene: mi.Scene, params: Any, sensor: mi.Sensor, seed: Any, spp: int
+        self, scene: mi.Scene, keys: frozenset[str], sensor: mi.Sensor, seed: Any, spp: int
     ) -> bool:
         """Learns, if it is time. Returns whether it knows more than what is best for the image.
 
         Parameters:
-            scene, params, sensor, seed, spp: Those of a pass for gradients.
+            keys: The names of the parameters that have gradients.
+            scene, sensor, seed, spp: Those of a pass for gradients.
         """
         if not self.can_learn or self.learned_state.load:
             return False
-        items = params.items() if hasattr(params, "items") else ()
-        keys = frozenset(str(key) for key, x in items if dr.grad_enabled(x))
         is_known = self._has_requested(scene, keys) and not self.is_due
         self._renders += 1
         if not is_known:
             self.forget()
             self._requested, self._optimized = (SceneMark(scene), keys), Optimized(scene)
             if self._optimized.lights_differ:
-                self._learn(scene, sensor, seed, spp)
+                seed = int(mi.UInt32(seed)[0])
+                self.learn(Request(scene, sensor, seed, spp, timeout=self.timeout))
             self._renders = 1
         return self._knows(scene)
 
@@ -65,19 +64,6 @@ class SensitivePath(RememberingPath):
             return False
         mark, known = self._requested
         return known == keys and mark.is_of(scene)
-
-    def _learn(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> None:
-        spp = spp or sensor.sampler().sample_count()
-        # Pilots are three quarters of the samples
-        samples = min(4 * self._pilot_spp // 3 + 1, spp * (self.learn_every or 16) // 4)
-        # Not the random numbers of the pass that uses what is learned
-        seed = int((mi.UInt32(seed) + 0x9E3779B9)[0])
-        request = Request(
-            scene, sensor, seed, max(4, samples), develop=False, timeout=self.timeout,
-            progress=self.progress,
-        )  # fmt: skip
-        with dr.suspend_grad():
-            self.render_once(request)
 
     def estimators(self, request: Request, spp: int, learning: LearningPlan) -> Estimators:
         def sensitive(decisions: Decisions, observer: Observer | None = None) -> Estimator:

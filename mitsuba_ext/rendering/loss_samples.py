@@ -7,18 +7,19 @@ import mitsuba as mi
 import numpy as np
 
 from ..images.box_filter import box_sums
-from ..transport.decisions import CameraSamples
-from ..transport.estimator import CameraRays, Sample
 from ..util.arrays import from_numpy
-from .camera import PixelLanes, camera_rays, draw_numbers, film_extent, put
+from .camera import PixelLanes, film_extent
 from .filter_weights import mean_weights
+from .gradient_pass import GradientSamples
 
 #: The share of the samples that is the same for all pixels on which the loss depends.
 _EVEN = 0.25
 
 
-class LossSamples:
-    """Camera rays for a pass that computes gradients. A pixel gets samples in proportion to the
+def loss_samples(
+    sensor: mi.Sensor, spp: int, grad_in: mi.TensorXf, seed: int
+) -> GradientSamples:
+    """Samples for a pass that computes gradients. A pixel gets samples in proportion to the
     derivative of the loss with respect to its value (and a quarter of them evenly), and none where
     no sample has an effect. Each sample is weighted by the inverse of the number of samples that
     its pixel has, or is expected to have, so that the expected gradient does not change.
@@ -27,62 +28,28 @@ class LossSamples:
 
     Parameters:
         sensor: The sensor, whose film is prepared.
-        sampler: Seeded for ``spp`` samples of each pixel.
         spp: Samples per pixel, on average.
         grad_in: The derivative of the loss with respect to the image.
         seed: Places the groups.
     """
-
-    def __init__(
-        self, sensor: mi.Sensor, sampler: mi.Sampler, spp: int, grad_in: mi.TensorXf, seed: int
-    ) -> None:
-        self._film, self._spp, self._grad = sensor.film(), spp, grad_in
-        share = _shares(self._film, grad_in)
-        places = (np.arange(share.size) + np.random.default_rng(seed).random()) / share.size
-        pixels = np.searchsorted(np.cumsum(share), places * share.sum(), side="right")
-        pixels = np.minimum(pixels, np.flatnonzero(share)[-1])
-        # A pixel that is certain to be sampled has the mean of its groups, whatever their number
-        counts = np.bincount(pixels, minlength=share.size)
-        expected = share / share.sum() * share.size
-        weights = 1 / np.where(expected < 1, expected, counts)[pixels]
-
-        group = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
-        lanes = PixelLanes(dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), group))
-        numbers = draw_numbers(sensor, sampler, None, CameraSamples())
-        self.rays: CameraRays = camera_rays(sensor, lanes.lanes(self._film), numbers, spp)
-        self._weight = dr.gather(mi.Float, from_numpy(mi.Float, weights), group)
-
-    def derivatives(self) -> mi.Spectrum:
-        """The derivative of the loss with respect to the radiance of each sample."""
-        of_film, rays = self._derivatives_of_film(), self.rays
-        with dr.resume_grad():
-            L = dr.full(mi.Spectrum, 1, dr.width(self._weight))
-            dr.enable_grad(L)
-            block = self._film.create_block()
-            block.set_coalesce(block.coalesce() and self._spp >= 4)
-            put(self._film, block, rays, Sample(L, mi.Bool(True)), [], self._weight)
-            _propagate(block.tensor(), of_film)
-            return dr.grad(L)
-
-    def _derivatives_of_film(self) -> mi.TensorXf:
-        """The derivative of the loss with respect to the sums of the film, which it divides by the
-        filter weights. Here these are their means: where samples are few, they vary too much."""
-        film = self._film
-        weights = mean_weights(film)[..., None] * self._spp
-        weights = np.repeat(weights, film.create_block().channel_count(), axis=2)
-        with dr.resume_grad():
-            sums = mi.TensorXf(weights.astype(np.float32))
-            dr.enable_grad(sums)
-            film.put_block(mi.ImageBlock(sums, offset=film.crop_offset()))
-            _propagate(film.develop(), self._grad)
-            film.clear()
-            return dr.grad(sums)
-
-
-def _propagate(result: mi.TensorXf, derivative: mi.TensorXf) -> None:
-    dr.set_grad(result, derivative)
-    dr.enqueue(dr.ADMode.Backward, result)
-    dr.traverse(dr.ADMode.Backward)
+    film = sensor.film()
+    share = _shares(film, grad_in)
+    places = (np.arange(share.size) + np.random.default_rng(seed).random()) / share.size
+    pixels = np.searchsorted(np.cumsum(share), places * share.sum(), side="right")
+    pixels = np.minimum(pixels, np.flatnonzero(share)[-1])
+    # A pixel that is certain to be sampled has the mean of its groups, whatever their number
+    counts = np.bincount(pixels, minlength=share.size)
+    expected = share / share.sum() * share.size
+    weights = 1 / np.where(expected < 1, expected, counts)[pixels]
+    group = dr.arange(mi.UInt32, len(pixels) * spp) // dr.opaque(mi.UInt32, spp)
+    lanes = PixelLanes(dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), group))
+    # The film divides by the mean sums of weights: where samples are few, sums vary too much
+    sums = mean_weights(film)[..., None] * spp
+    sums = np.repeat(sums, film.create_block().channel_count(), axis=2)
+    return GradientSamples(
+        lanes, spp, dr.gather(mi.Float, from_numpy(mi.Float, weights), group),
+        mi.TensorXf(sums.astype(np.float32)),
+    )  # fmt: skip
 
 
 def _shares(film: mi.Film, grad_in: mi.TensorXf) -> np.ndarray:

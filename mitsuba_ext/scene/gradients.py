@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..util.arrays import from_numpy
 from .bsdfs import all_bsdfs, contains_bsdf, diffuse_weight
 from .media import has_instances, may_have_media, scene_media
 from .parameter_values import values_of
@@ -29,23 +30,32 @@ class Distribution(enum.IntEnum):
     NONE, GGX, BECKMANN = range(3)
 
 
-def refuse_geometry(plugin: str, params: Any) -> None:
+def refuse_geometry(plugin: str, keys: Collection[str]) -> None:
     """
     Parameters:
         plugin: Name of the integrator.
-        params: The parameters passed to ``mi.render``, such as the result of ``mi.traverse``.
+        keys: The names of the parameters that have gradients.
 
     Raises:
         NotImplementedError: Gradients with respect to geometry are requested.
     """
-    if not (isinstance(params, Mapping) or hasattr(params, "items")):
-        return
-    for key, value in params.items():
-        if str(key).rpartition(".")[2] in _GEOMETRY and dr.grad_enabled(value):
+    for key in keys:
+        if key.rpartition(".")[2] in _GEOMETRY:
             raise NotImplementedError(
                 f'"{plugin}": there are no gradients with respect to "{key}", which changes '
                 f'geometry; use "prb" or "prb_projective"'
             )
+
+
+def has_roughness(keys: Collection[str]) -> bool:
+    """Whether any of the parameters with these names is the roughness of a BSDF."""
+    return any(_ROUGHNESS & set(key.split(".")) for key in keys)
+
+
+def optimized_parameters(params: Any) -> dict[str, Any]:
+    """The parameters that have gradients, among those that were passed to ``mi.render``."""
+    items = params.items() if hasattr(params, "items") else ()
+    return {str(key): value for key, value in items if dr.grad_enabled(value)}
 
 
 def without_gradients(params: Any) -> list[str]:
@@ -54,10 +64,9 @@ def without_gradients(params: Any) -> list[str]:
     if dr.flag(dr.JitFlag.FreezingScope):
         return []
     return sorted(
-        str(key)
-        for key, value in (params.items() if hasattr(params, "items") else ())
-        if dr.grad_enabled(value) and not np.any(np.array(dr.grad(value)) != 0)
-    )
+        key for key, value in optimized_parameters(params).items()
+        if not np.any(np.array(dr.grad(value)) != 0)
+    )  # fmt: skip
 
 
 def has_gradients(*things: mi.Object) -> bool:
@@ -152,7 +161,7 @@ class RoughBSDFs:
         kinds, α = (np.zeros(max(found) + 1, kind) for kind in (np.uint32, np.float32))
         for index, values in found.items():
             kinds[index], α[index] = values
-        self.kinds, self.α = mi.UInt32(kinds), mi.Float(α)
+        self.kinds, self.α = from_numpy(mi.UInt32, kinds), from_numpy(mi.Float, α)
         self._used = {kind for kind, _ in found.values()}
 
     @classmethod
@@ -256,7 +265,7 @@ def _table(flags: Mapping[int, bool]) -> mi.Float:
     # An unknown object, such as one of a shape group, counts as optimized
     table = np.ones(max(flags, default=0) + 1, np.float32)
     table[[*flags]] = [*flags.values()]
-    return mi.Float(table)
+    return from_numpy(mi.Float, table)
 
 
 def _gathered(table: mi.Float, pointer: mi.BSDFPtr | mi.MediumPtr | mi.EmitterPtr) -> mi.Float:

@@ -105,12 +105,14 @@ class _Current:
         scene: Its scene.
         values: Parameters of scene and sensor that are not arrays, and the number of threads.
         own: Addresses of the scene's objects.
+        hidden: Arrays of the scene that Dr.Jit does not find in it.
     """
 
     kept: _SceneRecordings
     scene: mi.Scene
     values: Any
     own: frozenset[int]
+    hidden: list[Any]
 
 
 class _Thread(threading.local):
@@ -260,10 +262,17 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     own = frozenset(address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
     # Kernels whose threads accumulate separately have memory for this number of threads
     threads = dr.thread_count()
-    values = threads, address(sensor), _values(parameters), _values(mi.traverse(sensor))
+    hidden = [
+        value for node in nodes if isinstance(node, mi.PhaseFunction) or _is_raw(node)
+        for _, value in values_of(mi.traverse(node)) if dr.is_jit_v(value)
+    ]  # fmt: skip
+    values = (
+        threads, address(sensor), _values(parameters), _values(mi.traverse(sensor)),
+        tuple(map(_literals, hidden)),
+    )  # fmt: skip
     if address(sensor) not in own:
         kept.held[address(sensor)] = sensor
-    return _Current(kept, scene, values, own)
+    return _Current(kept, scene, values, own, hidden)
 
 
 def _kept(mark: SceneMark) -> _SceneRecordings:
@@ -283,11 +292,28 @@ def _is_foreign(thing: mi.Object) -> bool:
     return is_python and not isinstance(thing, (mi.Sampler, mi.Integrator))
 
 
+def _is_raw(node: mi.Object) -> bool:
+    return isinstance(node, mi.Texture) and node.class_name() == "RawConstantTexture"
+
+
+def _literals(value: Any) -> Any:
+    """The numbers of which a kernel consists where it reads ``value``; ``None`` for others."""
+    if dr.depth_v(value) > 1:
+        return tuple(map(_literals, value))
+    is_literal = not dr.is_tensor_v(value) and value.state == dr.VarState.Literal
+    return value[0] if is_literal else None
+
+
 def _values(parameters: mi.SceneParameters) -> tuple:
     """The parameters that are not arrays: kernels contain them, and users may change them."""
+    # The types of most arrays are known without a look at the arrays, which takes longer
+    keys = (
+        key for key, (_, kind, *_) in parameters.properties.items()
+        if kind is None or not dr.is_jit_v(kind)
+    )  # fmt: skip
     return tuple(
         (key, value if isinstance(value, VALUES) else str(value))
-        for key, value in values_of(parameters)
+        for key, value in values_of(parameters, keys)
         if not _holds_arrays(value)
     )
 
@@ -319,7 +345,7 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
             kept.recordings.popitem(last=False)
     kept.recordings.move_to_end(key)
     try:
-        result = recording(args, description.arrays)
+        result = recording(args, [*description.arrays, *current.hidden])
         if is_new:
             _check_result(function, result)
     except NotRecordableError as error:

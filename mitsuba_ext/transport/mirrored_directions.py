@@ -65,11 +65,11 @@ class PairedNumbers:
     is_second: mi.Bool
 
     @classmethod
-    def begin(cls, sampler: mi.Sampler, seed: mi.UInt32 | int) -> PairedNumbers:
-        """Before the first number. ``sampler`` has been seeded for all lanes."""
+    def begin(cls, sampler: mi.Sampler, seed: mi.UInt32) -> PairedNumbers:
+        """Before the first number. ``sampler`` has been seeded for all lanes. ``seed`` is an opaque
+        number."""
         lane = dr.arange(mi.UInt32, sampler.wavefront_size())
-        # Opaque: seeds share a kernel
-        word, _ = mi.sample_tea_32(dr.opaque(mi.UInt32, int(mi.UInt32(seed)[0])), lane >> 1)
+        word, _ = mi.sample_tea_32(seed, lane >> 1)
         numbers = cls(sampler, word, mi.UInt32(0), mi.Bool(False), (lane & 1) == 1)
         dr.eval(numbers.word, numbers.is_second)
         return numbers

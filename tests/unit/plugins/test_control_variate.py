@@ -201,7 +201,7 @@ def test_what_composed_prb_learns_again_does_not_part_two_renders() -> None:
         for x in range(3)
     }
     scene = small(**lamps)
-    integrator = wrapped(plain("composed_prb", next_event="contribution", learn_every=5))
+    integrator = wrapped(plain("composed_prb", next_event="contribution", learn_every=3))
     known = []
     for step in range(7):
         integrator.render(scene, seed=step, spp=16)

@@ -258,6 +258,22 @@ def test_changes_of_a_scene_are_seen(change: str, name: str) -> None:
     assert after.shape != before.shape or np.abs(after - before).max() > 1e-3 * before.mean()
 
 
+@pytest.mark.parametrize("opaque", [False, True])
+def test_changes_of_a_phase_function_are_seen(opaque: bool) -> None:
+    """Mitsuba hides its arrays from Dr.Jit."""
+    fog = {"type": "homogeneous", "sigma_t": 4.0, "phase": {"type": "hg", "g": 0.5}}
+    scene = _scene(fog={"type": "sphere", "center": [0, -0.6, 0.5], "radius": 0.5,
+                        "bsdf": {"type": "null"}, "interior": fog})  # fmt: skip
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    before = _image(scene, integrator)
+    for g in (-0.9, 0.9):
+        value = dr.opaque(mi.Float, g) if opaque else mi.Float(g)
+        _updated("phase_function.g", lambda _, g=value: g)(scene)
+        after = _image(scene, integrator)
+        _assert_same(after, _traced(scene, integrator))
+        assert np.abs(after - before).max() > 0.01 * before.mean()
+
+
 def test_scenes_that_share_their_sensor_are_two() -> None:
     """They differ in what no parameter tells."""
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
