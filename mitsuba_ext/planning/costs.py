@@ -33,8 +33,8 @@ GUIDED_FLIGHTS = 1.25
 
 #: The time of mixing directions to focal points with BSDF samples, and the time of each box, as
 #: shares of the time of a sample. (With 32 boxes: keyhole 1.2 times the time of ``path``, a slit
-#: in a wall 1.66, cornell_box, whose paths are cheap, above 2: what loses is not kept.)
-FOCAL_CHOICE, FOCAL_BOX = 0.1, 0.03
+#: in a wall 1.7, cornell_box, whose paths are cheap, above 2.)
+FOCAL_CHOICE, FOCAL_BOX = 0.1, 0.02
 
 #: The candidates of resampled lights, and the connections to lights, that take about as long as a
 #: path.

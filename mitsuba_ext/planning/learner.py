@@ -48,6 +48,12 @@ class Learner(Observer):
     #: until now, so that these are left out of the image.
     discards_pilots = False
 
+    #: Whether another learner may take the place of this one, where it is more efficient.
+    can_be_replaced = False
+
+    #: The slots whose learners this one replaces from now on: they decide as ``path``.
+    replaces: tuple[str, ...] = ()
+
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
         """The decision of the first pilot. ``p``, ``n``: vertices and normals that the scout has
         found, empty if no learner wants one."""

@@ -196,6 +196,10 @@ class Planner(Schedule):
         pilot = Pilot(self._setting.scene, self.is_at_end)
         for slot, learner in self.learners.items():
             self.decide(**{slot: learner.learn(pilot)})
+        for slot in [slot for x in self.learners.values() for slot in x.replaces]:
+            self.decide(**{slot: None})
+            if slot in self.learners:
+                self.learners.pop(slot).finish()
         if pilot.is_last:
             if self._savers:
                 self._states = {slot: x.state() for slot, x in self.learners.items()}

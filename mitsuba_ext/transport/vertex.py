@@ -115,3 +115,8 @@ class Vertex:
     def depth(self) -> mi.UInt32:
         """0 at the first vertex of a path."""
         return self.path.depth
+
+    @property
+    def is_smooth(self) -> mi.Bool:
+        """Whether the BSDF has a lobe that is not specular; false in media."""
+        return mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Smooth)

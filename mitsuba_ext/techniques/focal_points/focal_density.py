@@ -65,6 +65,11 @@ class FocalDensity:
         """A density whose rows choose no box."""
         return cls(np.zeros((1, 3)), np.ones((1, 3)), np.zeros((rows, 1)))
 
+    @property
+    def has_boxes(self) -> bool:
+        """Whether a row chooses one."""
+        return bool(self.table[:, 0].any())
+
     def state(self) -> dict[str, np.ndarray]:
         """The density as arrays."""
         return {"low": self.low, "high": self.high, "table": self.table}
@@ -112,44 +117,39 @@ class FocalDensity:
         length = dr.norm(d)
         return dr.select(length > 0, d / length, mi.Vector3f(0, 0, 1))
 
-    @dr.syntax
     def density(
         self, row: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> mi.Float:
         """The solid angle density of the direction ``d`` from ``p``."""
-        index, total, below = mi.UInt32(0), mi.Float(0), mi.Float(0)
-        start, inverse = row * (self._count + 1) + 1, _inverse(d)
-        while dr.hint(active & (index < self._count), label="boxes"):
-            low, high, scale = self._box(index, active)
-            above = dr.gather(mi.Float, self._table, start + index, active)
-            total += (above - below) * scale * _seen(low - p, high - p, inverse)
-            below = above
-            index += 1
-        return total
+        return self.densities(row, p, (d,), active)[0]
 
     @dr.syntax
     def densities(
-        self, row: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, e: mi.Vector3f, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float]:
-        """The densities of two directions from ``p``."""
-        index, total, other, below = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0)
-        start, inverse, other_inverse = row * (self._count + 1) + 1, _inverse(d), _inverse(e)
-        while dr.hint(active & (index < self._count), label="boxes in two directions"):
+        self, row: mi.UInt32, p: mi.Point3f, directions: tuple[mi.Vector3f, ...], active: mi.Bool
+    ) -> tuple[mi.Float, ...]:
+        """The solid angle densities of some directions from ``p``."""
+        index, below = mi.UInt32(0), mi.Float(0)
+        start = row * (self._count + 1) + 1
+        inverses, totals = [_inverse(d) for d in directions], [mi.Float(0)] * len(directions)
+        while dr.hint(active & (index < self._count), label="boxes"):
             low, high, scale = self._box(index, active)
             low, high = low - p, high - p
             above = dr.gather(mi.Float, self._table, start + index, active)
-            scale *= above - below
-            total += scale * _seen(low, high, inverse)
-            other += scale * _seen(low, high, other_inverse)
+            totals = _with_box(totals, (above - below) * scale, low, high, inverses)
             below = above
             index += 1
-        return total, other
+        return tuple(totals)
 
     def _box(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Point3f, mi.Point3f, mi.Float]:
         """The corners of a box, and 1 / (3 · volume)."""
         low = dr.gather(mi.Vector4f, self._boxes, 2 * index, active)
         high = dr.gather(mi.Vector4f, self._boxes, 2 * index + 1, active)
         return mi.Point3f(low.x, low.y, low.z), mi.Point3f(high.x, high.y, high.z), low.w
+
+
+def _with_box(totals, scale, low, high, inverses) -> list[mi.Float]:
+    """The densities with one box more."""
+    return [dr.fma(scale, _seen(low, high, x), total) for x, total in zip(inverses, totals)]
 
 
 def _inverse(d: mi.Vector3f) -> mi.Vector3f:

@@ -47,7 +47,12 @@ class FocalPoints(Technique):
         # The scout has one path in each pixel
         least = max(1.0, _REGION_SAMPLES * width * height / samples)
         bounces = min(_BOUNCES, setting.max_depth - 1)
-        return FocalLearner(self.boxes, bounces, least, samples, (width, height), self.always_use)
+        rival = others.get("directions")
+        if self.always_use or rival is None or not rival.can_be_replaced:
+            rival = None
+        return FocalLearner(
+            self.boxes, bounces, least, samples, (width, height), rival, self.always_use
+        )
 
 
 TECHNIQUES = (FocalPoints,)

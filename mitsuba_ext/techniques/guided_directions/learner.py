@@ -148,6 +148,10 @@ class GuideLearner(Learner):
         self._flights = flights
 
     @property
+    def can_be_replaced(self) -> bool:
+        return not self.always
+
+    @property
     def learns_beside_light_paths(self) -> bool:
         return self.guide is not None and self.guidance is not None
 

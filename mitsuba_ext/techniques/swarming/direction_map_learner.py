@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ...planning.pixel_estimates import brightness
 from .map_learner import MapLearner
-from .mapped_scattering import SHARE, MappedScattering, is_smooth
+from .mapped_scattering import SHARE, MappedScattering
 from .tile_counts import Choices
 
 
@@ -34,7 +34,7 @@ class DirectionMapLearner(MapLearner):
             # The radiance of a path never decreases: its minimum is that before the first bounce.
             # Floats that are not negative have the order of their bits
             bits = dr.reinterpret_array(mi.UInt32, dr.maximum(brightness(L), 0))
-            active = active & is_smooth(vertex)
+            active = active & vertex.is_smooth
             dr.scatter_reduce(dr.ReduceOp.Min, self._before, bits, self._lane, active)
 
     def choices(self, radiance: mi.Float) -> Choices:

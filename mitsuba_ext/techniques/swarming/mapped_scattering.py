@@ -12,9 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.bsdfs import eval_bsdf
-from ...transport.path_decisions import Scattering
-from ...transport.vertex import Vertex
+from ...transport.path_decisions import MixedScattering, Scattering
 from .cells import CellDensities, Cells
 
 #: The share of the directions that maps choose.
@@ -24,8 +22,8 @@ SHARE = 0.5
 _BITS = 5
 
 
-class MappedScattering(Scattering):
-    """Mixes directions of a map with BSDF samples. Its densities are the densities of the mixture.
+class MappedScattering(MixedScattering):
+    """Mixes directions of a map with BSDF samples: Eq. 9.2 (Cline).
 
     Attributes:
         cells, maps, tiles: See
@@ -53,81 +51,40 @@ class MappedScattering(Scattering):
 
     def sample(self, state, ctx, vertex, wo, sample_1, sample_2):
         if state is None:
-            return super().sample(state, ctx, vertex, wo, sample_1, sample_2)
-        is_first = state & is_smooth(vertex)
+            return Scattering.sample(self, state, ctx, vertex, wo, sample_1, sample_2)
+        is_first = state & vertex.is_smooth
         if self.maps is None:
-            *result, _ = super().sample(state, ctx, vertex, wo, sample_1, sample_2)
-            bs = result[2]
-            found = self.cells.find(_to_square(vertex.si.to_world(bs.wo)))
-            self._record(found, mi.Float(1), bs, bs.pdf, is_first)
-            return *result, state & ~is_first
-        from_map = is_first & (sample_1 < SHARE)
-        stretched = dr.select(from_map, sample_1 / SHARE, (sample_1 - SHARE) / (1 - SHARE))
-        sample_1 = dr.select(is_first, dr.clip(stretched, 0, 1 - 2**-24), sample_1)
-        value, pdf, bs, weight, _ = super().sample(state, ctx, vertex, wo, sample_1, sample_2)
-        table = self._table(vertex)
-        # A direction of the map
-        drawn, _, _ = self.maps.sample(table, [sample_2.x, sample_2.y], from_map)
-        direction = vertex.si.to_local(_to_sphere(drawn))
-        of_map, pdf_of_bsdf = eval_bsdf(vertex.bsdf, ctx, vertex.si, direction, from_map)
-        is_smooth_sample = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        bs_value = dr.select(from_map, of_map, weight * bs.pdf)
-        pdf_of_bsdf = dr.select(from_map, pdf_of_bsdf, bs.pdf)
-        bs.wo = dr.select(from_map, direction, bs.wo)
-        bs.eta = dr.select(from_map, 1, bs.eta)
-        bs.sampled_type = dr.select(
-            from_map, mi.UInt32(+mi.BSDFFlags.GlossyReflection), bs.sampled_type
-        )
-        mixes = from_map | (is_first & is_smooth_sample)
-        cell = self.cells.find(_to_square(vertex.si.to_world(bs.wo)))
-        mixture = self._mixture(table, cell, pdf_of_bsdf, mixes)
-        bs.pdf = dr.select(mixes, mixture, bs.pdf)
-        found = dr.select(mixture > 0, bs_value / mixture, 0)
-        # Directions that only the BSDF finds are sampled with the probability 1 − SHARE
-        others = dr.select(is_first, weight / (1 - SHARE), weight)
-        weight = dr.select(mixes, found, others)
+            *result, _ = Scattering.sample(self, state, ctx, vertex, wo, sample_1, sample_2)
+            mixes, pdf = is_first, result[2].pdf
+        else:
+            *result, mixes, pdf = self.mixed_sample(state, ctx, vertex, wo, sample_1, sample_2)
         if self.is_recorded:
-            ratio = dr.select(pdf_of_bsdf > 0, mixture / pdf_of_bsdf, 0)
-            self._record(cell, ratio, bs, pdf_of_bsdf, mixes)
-        pdf = self._with_map(table, vertex, wo, pdf, is_first)
-        return value, pdf, bs, weight, state & ~is_first
+            self._record(vertex, result[2], pdf, mixes)
+        return *result, state & ~is_first
 
     def eval_pdf(self, state, ctx, vertex, wo, active):
-        value, pdf = super().eval_pdf(state, ctx, vertex, wo, active)
-        if state is None or self.maps is None:
-            return value, pdf
-        is_first = state & is_smooth(vertex) & active
-        return value, self._with_map(self._table(vertex), vertex, wo, pdf, is_first)
+        kind = Scattering if state is None or self.maps is None else MixedScattering
+        return kind.eval_pdf(self, state, ctx, vertex, wo, active)
 
-    def _table(self, vertex: Vertex) -> mi.UInt32:
-        return self.tiles.tile(vertex.pixel)
+    def share(self, state, vertex, active):
+        return self.tiles.tile(vertex.pixel), dr.select(state & active, mi.Float(SHARE), 0)
 
-    def _with_map(self, table, vertex, wo, pdf, active) -> mi.Float:
-        """The density of the mixture in a local direction."""
-        cell = self.cells.find(_to_square(vertex.si.to_world(wo)))
-        return dr.select(active, self._mixture(table, cell, pdf, active), pdf)
+    def direction(self, place, vertex, number, point, active):
+        drawn, _, _ = self.maps.sample(place, [point.x, point.y], active)
+        return mi.warp.square_to_uniform_sphere(mi.Point2f(*drawn))
 
-    def _mixture(self, table, cell, pdf, active) -> mi.Float:
-        of_map = self.maps.density(table, cell, active) * dr.inv_four_pi
-        return dr.lerp(pdf, of_map, SHARE)  # Eq. 9.2 (Cline)
+    def densities(self, place, vertex, directions, active):
+        return tuple(
+            self.maps.density(place, self._cell(d), active) * dr.inv_four_pi for d in directions
+        )
 
-    def _record(self, cell, density, bs, pdf, active) -> None:
+    def _cell(self, d: mi.Vector3f) -> mi.UInt32:
+        """The cell of a direction in the world."""
+        u = mi.warp.uniform_sphere_to_square(d)
+        return self.cells.find([dr.clip(u.x, 0, 1 - 2**-24), dr.clip(u.y, 0, 1 - 2**-24)])
+
+    def _record(self, vertex, bs, pdf, active) -> None:
         active = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (pdf > 0)
-        dr.scatter(self.cell, cell, self.lane, active)
-        dr.scatter(self.density, density, self.lane, active)
+        dr.scatter(self.cell, self._cell(vertex.si.to_world(bs.wo)), self.lane, active)
+        dr.scatter(self.density, bs.pdf / pdf, self.lane, active)
         dr.scatter(self.inverse, dr.inv_four_pi / pdf, self.lane, active)
-
-
-def is_smooth(vertex: Vertex) -> mi.Bool:
-    """Whether the BSDF has a lobe that is not specular."""
-    return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
-
-
-def _to_sphere(u: list[mi.Float]) -> mi.Vector3f:
-    return mi.warp.square_to_uniform_sphere(mi.Point2f(*u))
-
-
-def _to_square(d: mi.Vector3f) -> list[mi.Float]:
-    """The inverse of :func:`_to_sphere`."""
-    u = mi.warp.uniform_sphere_to_square(d)
-    return [dr.clip(u.x, 0, 1 - 2**-24), dr.clip(u.y, 0, 1 - 2**-24)]

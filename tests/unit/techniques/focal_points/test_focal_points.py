@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.planning.learner import Pilot
 from mitsuba_ext.planning.planner import LearningPlan, Planner
 from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
 from mitsuba_ext.techniques.focal_points.fitting import LineArrays, fitted_boxes, fitted_rows
 from mitsuba_ext.techniques.focal_points.focal_density import FocalDensity
 from mitsuba_ext.techniques.focal_points.learner import FocalLearner
+from mitsuba_ext.techniques.focal_points.line_records import change_of_squares
 from mitsuba_ext.transport.decisions import Decisions
+from mitsuba_ext.transport.vertex import Vertex
 from tests.support.statistical import load
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -42,18 +46,20 @@ def test_directions_to_boxes_have_their_density(p: tuple[float, ...]) -> None:
     assert test.run(0.01), test.messages
     np.testing.assert_allclose(density.share(row, active).numpy(), 0.6, rtol=1e-6)
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(np.random.default_rng(1).random((2, 999))))
-    both = density.densities(row, mi.Point3f(p), d, -d, active)
+    both = density.densities(row, mi.Point3f(p), (d, -d), active)
     for found, direction in zip(both, (d, -d)):
         expected = density.density(row, mi.Point3f(p), direction, active)
         np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=1e-5)
 
 
-def _vertex(bsdf: dict, count: int) -> SimpleNamespace:
+def _vertex(bsdf: dict, count: int) -> Vertex:
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.sh_frame = mi.Frame3f(mi.Normal3f(dr.normalize(mi.Vector3f(0.8, 0.4, 0.4))))
     si.n, si.wi = si.sh_frame.n, dr.normalize(mi.Vector3f(0.5, -0.3, 0.8))
     plugin = mi.load_dict(bsdf)
-    return SimpleNamespace(si=si, bsdf=mi.BSDFPtr(plugin), held=plugin, medium=None, lobes=None)
+    vertex = Vertex(si, mi.BSDFPtr(plugin), path=None)
+    vertex.held = plugin
+    return vertex
 
 
 @pytest.mark.parametrize("bsdf", [
@@ -129,8 +135,8 @@ def test_one_line_and_equal_points_give_boxes() -> None:
 def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
     """A learner says so before the third stage."""
     learner = SimpleNamespace(
-        wants_scout=False, discards_pilots=False, start=lambda *_: None, finish=lambda: None,
-        effect=None, learn=lambda pilot: None,
+        wants_scout=False, discards_pilots=False, replaces=(), start=lambda *_: None,
+        finish=lambda: None, effect=None, learn=lambda pilot: None,
     )  # fmt: skip
     technique = SimpleNamespace(
         decision=lambda setting: None, learner=lambda *_: learner, doubles=False,
@@ -149,28 +155,70 @@ def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
     assert discards == [False, False, True, False]
 
 
-@pytest.mark.parametrize("pays", [True, False])
-def test_pilots_count_if_focal_points_do_not_pay(pays: bool, monkeypatch) -> None:
-    learner = FocalLearner(256, 5, 1.0, 100, (4, 4))
-    density = SimpleNamespace(table=np.ones((1, 257)), count=256)
-    learner.decision = SimpleNamespace(density=density)
-    learner._records = SimpleNamespace(lines=lambda: (), paths=50, restart=lambda: None)
+def _learner(monkeypatch, variance: float, rival: Any = None) -> FocalLearner:
+    """A learner after a pilot whose lines show boxes with this variance, relative to ``path``."""
+    learner = FocalLearner(32, 5, 1.0, 100, (4, 4), rival)
+    learner._fitted = FocalScattering(FocalDensity.nothing(2), ALL)
+    learner._records = SimpleNamespace(
+        lines=lambda: (), paths=50, restart=lambda: None, stop=lambda: None
+    )
+    density = FocalDensity(LOW, HIGH, ROWS)
+
+    def fit(lines, bsdf):
+        learner._fitted = FocalScattering(density, ALL)
+
+    def variances(lines, bsdf, density, stride=1):
+        return np.full(32, variance), np.ones(32)
+
     monkeypatch.setattr(learner, "_bsdf_density", lambda lines: None)
-    monkeypatch.setattr(learner, "_gain", lambda lines, bsdf: (0.7, 0.0))
-    monkeypatch.setattr(learner, "_fit", lambda lines, bsdf: None)
-    learner.learn(SimpleNamespace(pays=lambda prediction: pays, is_last=False))
+    monkeypatch.setattr(learner, "_variances", variances)
+    monkeypatch.setattr(learner, "_may_be_worth", lambda *_: True)
+    monkeypatch.setattr(learner, "_fit", fit)
+    learner.learn(Pilot(None, False))
+    return learner
+
+
+@pytest.mark.parametrize("variance", [0.3, 0.9])
+def test_pilots_count_if_focal_points_do_not_pay(variance: float, monkeypatch) -> None:
+    learner = _learner(monkeypatch, variance)
+    assert learner.decision is not None and not learner.discards_pilots
+    learner.learn(Pilot(None, False))
+    pays = variance < 0.5
     assert learner.discards_pilots == pays and (learner.decision is not None) == pays
 
 
+@pytest.mark.parametrize("variance, efficiency, replaces", [
+    (0.3, 1.2, True), (0.3, 4.0, False), (0.9, 0.9, False),
+])  # fmt: skip
+def test_focal_points_replace_a_guide_that_is_less_efficient(
+    variance: float, efficiency: float, replaces: bool, monkeypatch
+) -> None:
+    learner = _learner(monkeypatch, variance, SimpleNamespace(efficiency=efficiency))
+    assert learner.decision is None and learner.replaces == ()
+    learner.learn(Pilot(None, False))
+    assert (learner.decision is not None) == replaces == ("directions" in learner.replaces)
+    assert learner.effect.is_kept == replaces
+    assert (learner.efficiency > 1) == replaces
+
+
+def test_the_squares_of_paths_with_other_densities() -> None:
+    """Paths 0 and 1 have two bounces; the second bounce of path 1 has found nothing."""
+    lines = SimpleNamespace(
+        path=mi.UInt32(0, 1, 0), bounce=mi.UInt32(0, 0, 1), value=mi.Float(3, 2, 1)
+    )
+    change = change_of_squares(lines, np.array([0.5, 3, 4]))
+    # Of path 0, light after the first bounce is 2 and 1 after the second
+    assert change[0] == pytest.approx((0.5 - 1) * 9 + (0.5 * 4 - 0.5) * 1)
+    assert change[1] == pytest.approx((3 - 1) * 4) and not change[2:].any()
+
+
 def test_without_boxes_directions_are_sampled_as_in_path(monkeypatch) -> None:
-    learner = FocalLearner(32, 5, 1.0, 100, (4, 4))
-    learner._records = SimpleNamespace(lines=lambda: (), paths=50, restart=lambda: None)
-    learner.decision = SimpleNamespace(density=FocalDensity.nothing(2))
-    monkeypatch.setattr(learner, "_bsdf_density", lambda lines: None)
+    learner = _learner(monkeypatch, 0.3)
+    learner._fitted = FocalScattering(FocalDensity.nothing(2), ALL)
     monkeypatch.setattr(learner, "_fit", lambda lines, bsdf: None)
     # The next pilot may find some
-    assert learner.learn(SimpleNamespace(is_last=False)) is not None
-    assert learner.learn(SimpleNamespace(is_last=True)) is None
+    assert learner.learn(Pilot(None, False)) is not None
+    assert learner.learn(Pilot(None, True)) is None
     assert str(learner) == "no focal points: the pilots found none"
 
 
