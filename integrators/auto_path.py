@@ -17,10 +17,10 @@ class AutoPath(WalkIntegrator):
     Self-configuring path tracer (:monosp:`auto_path`)
     --------------------------------------------------
 
-    A path tracer that chooses its techniques itself: guided directions, learned lights, and maps of
-    the times, lens points, wavelengths and distances in fog with which paths find light. Its first
-    samples test which of them reduce the noise of this scene by more than they cost, and it keeps
-    those.
+    A path tracer that chooses its techniques itself: guided directions or focal points, learned
+    lights, and maps of the times, lens points, wavelengths and distances in fog with which paths
+    find light. Its first samples test which of them reduce the noise of this scene by more than
+    they cost, and it keeps those.
 
     .. pluginparameters::
 
@@ -50,7 +50,7 @@ class AutoPath(WalkIntegrator):
        - |string|
        - Whether paths also connect to lights through smooth glass and mirrors
          (:monosp:`manifold`, or :monosp:`bounded_manifold`, which is **biased**), as in
-         :class:`composed_path`. (Default: scattered)
+         :class:`composed_path`. Focal points are then not tried. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -65,14 +65,15 @@ class AutoPath(WalkIntegrator):
     learned is saved or kept: learning, and compiling its kernels, would take longer than rendering
     all samples.
 
-    It is :monosp:`composed_path` with :monosp:`directions=guided`,
+    It is :monosp:`composed_path` with :monosp:`directions=guided`, :monosp:`scattering=focal`,
     :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
     :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; the pages of
-    :monosp:`guided_directions`, :monosp:`learned_lights` and :monosp:`swarm_path` describe what is
-    learned, and how. The maps are used in scenes with an open shutter, a lens or fog, and in
-    spectral variants; otherwise they cost nothing. The first two pilots are short. Together they
-    predict how much each technique reduces the variance of the image, and a technique that costs
-    more time than it saves is dropped then. The maps of lobes and of directions of
+    :monosp:`guided_directions`, :monosp:`focal_points`, :monosp:`learned_lights` and
+    :monosp:`swarm_path` describe what is learned, and how. Focal points are used in place of guided
+    directions, where they gain more. The maps are used in scenes with an open shutter, a lens or
+    fog, and in spectral variants; otherwise they cost nothing. The first two pilots are short.
+    Together they predict how much each technique reduces the variance of the image, and a technique
+    that costs more time than it saves is dropped then. The maps of lobes and of directions of
     :monosp:`swarm_path` are not tried, because guided directions take their place.
     :monosp:`integrator.statistics.learned` says which techniques were kept, and why.
 
@@ -80,8 +81,8 @@ class AutoPath(WalkIntegrator):
     :monosp:`prb`); neither are scalar and polarized variants. Nested in :monosp:`moment`, it takes
     no pilot samples.
 
-    Sources: see :monosp:`guided_directions`, :monosp:`learned_lights` and :monosp:`swarm_path`. The
-    predictions are ours.
+    Sources: see :monosp:`guided_directions`, :monosp:`focal_points`, :monosp:`learned_lights` and
+    :monosp:`swarm_path`. The predictions are ours.
 
     .. tabs::
         .. code-tab:: xml
@@ -100,5 +101,7 @@ class AutoPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        caustics = read_slot(self.name, props, "caustics")
-        self.fill(props, caustics=caustics, **auto_techniques(self.name))
+        techniques, caustics = auto_techniques(self.name), read_slot(self.name, props, "caustics")
+        if caustics is not None:
+            del techniques["scattering"]  # these connections know the densities of BSDFs only
+        self.fill(props, caustics=caustics, **techniques)

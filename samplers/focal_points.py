@@ -45,13 +45,20 @@ class FocalPointsPlugin(DecisionPlugin):
     the sum over the boxes that it crosses, and MIS weights are computed from the density of the
     mixture.
 
-    The second pilot draws directions to what the first one has found, and measures what that gains.
-    If it does not pay, directions are sampled as in :monosp:`path`. If it removes more than 60 % of
-    the variance, the samples of the first two pilots do not count towards the image, because they
-    would be its largest noise. With fewer than 3 pilot samples per pixel (:monosp:`pilot_spp` of
-    the integrator), nothing is learned. After a render, :monosp:`integrator.statistics.learned`
-    describes what was learned, and :monosp:`integrator.learners["scattering"].decision.density` has
-    the boxes.
+    Boxes that are fitted to half of the paths of the first pilot show, on the other half, whether
+    learning is hopeless. If it is not, the second pilot draws directions to what the first one has
+    found, and measures what that gains. If it does not pay, directions are sampled as in
+    :monosp:`path`. If it removes more than 60 % of the variance, the samples of the first two
+    pilots do not count towards the image, because they would be its largest noise. With fewer than
+    3 pilot samples per pixel (:monosp:`pilot_spp` of the integrator), nothing is learned. After a
+    render, :monosp:`integrator.statistics.learned` describes what was learned, and
+    :monosp:`integrator.learners["scattering"].decision.density` has the boxes.
+
+    Beside guided directions (:monosp:`directions=guided`), either one or the other is used: focal
+    points, if the first pilot predicts less than 0.4 of the variance, or if the second one predicts
+    a higher efficiency than it measures for guided directions. With :monosp:`always_use` here, or
+    :monosp:`always_guide` there, both are used together, which is unbiased, and gains little.
+    :class:`auto` and :class:`auto_path` choose in this way.
 
     In participating media, paths scatter as in :monosp:`volpath`. Nested in :monosp:`moment`, the
     integrator takes no pilot samples, and nothing is learned.
