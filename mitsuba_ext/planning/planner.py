@@ -243,8 +243,9 @@ class Planner(Schedule):
         trial = self._trial
         alone = {slot: x for slot, x in self.learners.items() if self._finds_all_light(slot)}
         again = {slot: x for slot, x in alone.items() if x.learns_beside_light_paths}
-        guides = math.prod(x.efficiency * x.growth for x in again.values())
-        others = math.prod(x.efficiency for slot, x in alone.items() if slot not in again)
+        efficiencies = {slot: x.efficiency * x.growth for slot, x in alone.items()}
+        guides = math.prod(efficiencies[slot] for slot in again)
+        others = math.prod(x for slot, x in efficiencies.items() if slot not in again)
         self._rival = Rival(self._margin * guides * others, guides)
         larger = trial.larger(self._rival)
         if larger is not None:

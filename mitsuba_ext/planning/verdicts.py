@@ -65,6 +65,9 @@ FAR_LESS = 0.4
 #: predict (door_ajar: 1.8 and 1.4).
 GUIDES_GROW = 1.25
 
+#: The same for focal points, relative to what the second pilot measures (1.2 to 1.5 in a slit).
+FOCAL_POINTS_GROW = 1.4
+
 #: Guided directions are expected to keep this power of their efficiency beside light paths. (The
 #: first pilots with both have guides of few samples, and show less.)
 _KEPT_BESIDE = 0.5

@@ -145,6 +145,9 @@ class MixedScattering(Scattering):
         bs.pdf = dr.select(mixes, mixture, bs.pdf)
         # Delta lobes are sampled with the probability 1 − share
         of_mixture = dr.select(mixture > 0, bsdf_value / mixture, 0)
+        vertex.sampling_weight = dr.select(
+            mixes & (bsdf_pdf > 0) & (mixture > 0), bsdf_pdf / mixture, 1
+        )
         weight = dr.select(mixes, of_mixture, weight / (1 - share))
         return value, dr.lerp(pdf, light, share), bs, weight, mixes, bsdf_pdf
 

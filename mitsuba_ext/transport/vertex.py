@@ -102,6 +102,8 @@ class Vertex:
         medium: The part that concerns media; ``None`` if the scene has none.
         lobes: The values of the diffuse lobes of the BSDF (:class:`.bsdfs.DiffuseLobes`), for light
             path expressions; ``None`` if they are not wanted.
+        sampling_weight: Where directions are not drawn from the BSDF alone: the density of the
+            sampled one among BSDF samples / its density (:class:`PathState`).
     """
 
     si: mi.SurfaceInteraction3f
@@ -110,6 +112,7 @@ class Vertex:
     pixel: mi.UInt32 | None = None
     medium: MediumVertex | None = None
     lobes: Any = None
+    sampling_weight: mi.Float | float = 1.0
 
     @property
     def depth(self) -> mi.UInt32:

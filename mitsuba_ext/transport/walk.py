@@ -291,7 +291,8 @@ class Walk:
             onward = PathState(
                 β=β,
                 η=path.η * bs.eta,
-                sampling_weight=path.sampling_weight * (directions_weight * hero_count),
+                sampling_weight=path.sampling_weight
+                * (directions_weight * hero_count * vertex.sampling_weight),
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,

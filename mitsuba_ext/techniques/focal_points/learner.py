@@ -274,6 +274,10 @@ class FocalLearner(Learner):
         return 1 / (self._effect.variance * self._effect.time)
 
     @property
+    def growth(self) -> float:
+        return 1.0 if self.decision is None else verdicts.FOCAL_POINTS_GROW
+
+    @property
     def effect(self) -> Effect | None:
         return self._effect
 
