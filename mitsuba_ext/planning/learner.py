@@ -54,6 +54,11 @@ class Learner(Observer):
     #: The slots whose learners this one replaces from now on: they decide as ``path``.
     replaces: tuple[str, ...] = ()
 
+    @property
+    def observer(self) -> Observer:
+        """What observes the samples of the next pilot."""
+        return self
+
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
         """The decision of the first pilot. ``p``, ``n``: vertices and normals that the scout has
         found, empty if no learner wants one."""

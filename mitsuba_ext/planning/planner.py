@@ -214,8 +214,8 @@ class Planner(Schedule):
         """The stage that comes next, with the decisions of now."""
         if self.is_at_end:
             return self._last_stage()
-        learners = list(self.learners.values())
-        observer = learners[0] if len(learners) == 1 else Observers(learners)
+        observers = [learner.observer for learner in self.learners.values()]
+        observer = observers[0] if len(observers) == 1 else Observers(observers)
         return Stage(
             self._estimator(self.decisions, observer),
             camera=self.decisions.camera,

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from ...scene.regions.nested_regions import NestedRegions
 from ...scene.regions.surface_voxels import lit_normal
 from ...transport.path_decisions import MixedScattering
-from ...transport.vertex import Vertex
 from .focal_density import FocalDensity
 
 
@@ -27,7 +24,7 @@ class FocalScattering(MixedScattering):
         return self.density, self.regions
 
     def share(self, state, vertex, active):
-        row = self.region(vertex, active)
+        row = self.regions.number(vertex.si.p, lit_normal(vertex.si), active)
         return row, self.density.share(row, active)
 
     def direction(self, place, vertex, number, point, active):
@@ -35,7 +32,3 @@ class FocalScattering(MixedScattering):
 
     def densities(self, place, vertex, directions, active):
         return self.density.densities(place, vertex.si.p, directions, active)
-
-    def region(self, vertex: Vertex, active: mi.Bool) -> mi.UInt32:
-        """The region of a vertex."""
-        return self.regions.number(vertex.si.p, lit_normal(vertex.si), active)

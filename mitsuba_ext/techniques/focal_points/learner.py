@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +15,7 @@ from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
 from ...scene.regions.nested_regions import NestedRegions
+from ...transport.observer import Observer
 from ...util.arrays import from_numpy
 from ...util.stored_arrays import StoredArrays
 from .decisions import FocalScattering
@@ -26,9 +26,9 @@ from .line_records import LineRecords, Lines, change_of_squares
 #: The lines from which boxes are fitted, and the probabilities of each region.
 _BOX_LINES, _REGION_LINES = 1 << 11, 1 << 14
 
-#: The lines from which boxes are fitted that only show whether learning is hopeless, and the most
-#: lines that show it. With fewer lines than the last number, nothing is known.
-_FEW_LINES, _SHOWING, _TOO_FEW = 1 << 9, 1 << 15, 1 << 6
+#: The lines from which boxes are fitted that only show whether learning is hopeless, and about the
+#: most lines of the paths that show it. With fewer lines than the last number, nothing is known.
+_FEW_LINES, _SHOWING, _TOO_FEW = 1 << 9, 1 << 14, 1 << 6
 
 #: The largest weight of a line, relative to the mean.
 _HEAVIEST = 64.0
@@ -102,30 +102,12 @@ class FocalLearner(Learner):
         regions = NestedRegions(p, n, self._least, _MOST_REGIONS)
         # As ``path``, but with the kernel of the pilots that follow
         self._fitted = FocalScattering(FocalDensity.nothing(regions.count), regions)
-        self._records = LineRecords(self._fitted.region, self._bounces, self._pixels)
+        self._records = LineRecords(regions, self._bounces, self._pixels)
         return self.decision
 
-    # ---- Observer ----
-
-    def kernel_state(self) -> list[Any]:
-        """The attributes on which kernels depend (``frozen.py``)."""
-        return [] if self._records is None else [self._records]
-
-    def begin(self, *arguments: Any) -> None:
-        if self._records is not None:
-            self._records.begin(*arguments)
-
-    def direction(self, *arguments: Any) -> None:
-        if self._records is not None:
-            self._records.direction(*arguments)
-
-    def scattering(self, *arguments: Any) -> None:
-        if self._records is not None:
-            self._records.scattering(*arguments)
-
-    def end(self, L: mi.Spectrum) -> None:
-        if self._records is not None:
-            self._records.end(L)
+    @property
+    def observer(self) -> Observer:
+        return self._records or Observer()
 
     # ---- Between the stages ----
 
@@ -179,12 +161,10 @@ class FocalLearner(Learner):
 
     def _may_be_worth(self, lines: Lines, bsdf: mi.Float, pilot: Pilot) -> bool:
         """Fits boxes to half of the paths, and predicts from the others what they would gain."""
-        path = lines.path.numpy()
-        is_other = path % 2 == 1
-        stride = max(1, np.count_nonzero(is_other) // _SHOWING)
-        # All batches of odd numbers have such paths
-        shows = is_other & (path // BATCHES % stride == 0)
-        fits, shows = (from_numpy(mi.UInt32, np.flatnonzero(x)) for x in (~is_other, shows))
+        stride = max(1, len(lines.path) // _SHOWING)
+        # All batches have such paths
+        is_some = lines.path // BATCHES % dr.opaque(mi.UInt32, stride) == 0
+        fits, shows = (dr.compress(is_some & (lines.path % 2 == odd)) for odd in (0, 1))
         if min(len(fits), len(shows)) < _TOO_FEW:
             return True
         some, bsdf_of_some = lines.chosen(fits), dr.gather(mi.Float, bsdf, fits)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -11,12 +10,14 @@ import numpy as np
 
 from ...planning.evidence import BATCHES
 from ...planning.pixel_estimates import PixelEstimates, brightness
+from ...scene.regions.nested_regions import NestedRegions
+from ...scene.regions.surface_voxels import lit_normal
 from ...transport.observer import Observer
 from ...transport.vertex import Vertex
 from ...util.arrays import joined
 
 #: The most paths of a pass that are recorded. Of the paths of a stage, four times as many.
-_MOST_PATHS = 1 << 18
+_MOST_PATHS = 1 << 16
 
 #: The number of paths of a pass once nothing is recorded any more (one would be another kernel).
 _NO_PATHS = 2
@@ -53,7 +54,7 @@ class LineRecords(Observer):
     """Records the first bounces of paths.
 
     Parameters:
-        region: Finds the region of a vertex.
+        regions: Finds the region of a vertex.
         bounces: Number of bounces of a path that are recorded.
         pixels: Receives the radiance of the paths.
 
@@ -66,11 +67,11 @@ class LineRecords(Observer):
 
     def __init__(
         self,
-        region: Callable[[Vertex, mi.Bool], mi.UInt32],
+        regions: NestedRegions,
         bounces: int,
         pixels: PixelEstimates,
     ) -> None:
-        self._region, self.bounces, self._pixels = region, bounces, pixels
+        self._regions, self.bounces, self._pixels = regions, bounces, pixels
         self._lanes, self._is_stopped = 0, False
         self.restart()
 
@@ -92,7 +93,7 @@ class LineRecords(Observer):
     def kernel_state(self) -> tuple:
         """The attributes on which kernels depend (``frozen.py``)."""
         return (
-            self._region, self.bounces, self._path, self._is_recorded, self._slots,
+            self._regions, self.bounces, self._path, self._is_recorded, self._slots,
             self._p, self._d, self._where, self._pdf, self._guided, self._before, self._total,
         )  # fmt: skip
 
@@ -131,7 +132,8 @@ class LineRecords(Observer):
         active &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         dr.scatter(self._p, vertex.si.p, slot, active)
         dr.scatter(self._d, vertex.si.to_world(bs.wo), slot, active)
-        dr.scatter(self._where, self._region(vertex, active), slot, active)
+        region = self._regions.number(vertex.si.p, lit_normal(vertex.si), active)
+        dr.scatter(self._where, region, slot, active)
         dr.scatter(self._pdf, bs.pdf, slot, active)
 
     def _slot(self, vertex: Vertex, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:

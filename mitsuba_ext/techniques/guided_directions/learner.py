@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from ...planning.learner import Learner, Pilot
 from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
 from ...planning.verdicts import GUIDES_GROW, is_trial, least
-from ...transport.observer import Observer
+from ...transport.observer import Observers
 from ...transport.path_decisions import Roulette
 from ...util.stored_arrays import StoredArrays
 from .decisions import AdjointRoulette, GuidedDirections, Regions
@@ -177,36 +177,10 @@ class GuideLearner(Learner):
     def start_again(self) -> GuidedDirections | None:
         return self.guide
 
-    # ---- Observer ----
-
-    def kernel_state(self) -> list[Observer]:
-        """The attributes on which kernels depend (``frozen.py``)."""
-        return self._observers()
-
-    def begin(self, *arguments: Any) -> None:
-        for observer in self._observers():
-            observer.begin(*arguments)
-
-    def direction(self, *arguments: Any) -> None:
-        for observer in self._observers():
-            observer.direction(*arguments)
-
-    def scattering(self, *arguments: Any) -> None:
-        for observer in self._observers():
-            observer.scattering(*arguments)
-
-    def survival(self, *arguments: Any) -> None:
-        for observer in self._observers():
-            observer.survival(*arguments)
-
-    def end(self, L: mi.Spectrum) -> None:
-        for observer in self._observers():
-            observer.end(L)
-
-    def _observers(self) -> list[Observer]:
-        if self._records is None:
-            return []
-        return [observer for observer in (self._records, self.trial) if observer is not None]
+    @property
+    def observer(self) -> Observers:
+        observers = () if self._records is None else (self._records, self.trial)
+        return Observers([observer for observer in observers if observer is not None])
 
     # ---- Between the stages ----
 

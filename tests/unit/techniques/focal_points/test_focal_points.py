@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning.learner import Pilot
+from mitsuba_ext.planning.learner import Learner, Pilot
 from mitsuba_ext.planning.planner import LearningPlan, Planner
 from mitsuba_ext.planning.technique import Setting
 from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
@@ -132,12 +132,11 @@ def test_one_line_and_equal_points_give_boxes() -> None:
         assert (high > low).all() and np.isfinite(probability).all()
 
 
-def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
+def test_pilots_do_not_count_once_they_are_far_noisier(monkeypatch) -> None:
     """A learner says so before the third stage."""
-    learner = SimpleNamespace(
-        wants_scout=False, discards_pilots=False, replaces=(), start=lambda *_: None,
-        finish=lambda: None, effect=None, learn=lambda pilot: None,
-    )  # fmt: skip
+    learner = Learner()
+    learner.start = learner.learn = lambda *_: None
+    monkeypatch.setattr(Learner, "__str__", lambda self: "")
     technique = SimpleNamespace(
         decision=lambda setting: None, learner=lambda *_: learner, doubles=False,
         bytes_per_sample=0,

@@ -54,17 +54,18 @@ def _pilot(
 ) -> None:
     """The first of two directions decides nothing."""
     pixel, numbers = _pixels(), _Numbers(seed)
-    learner.begin(LANES, pixel)
+    observer = learner.observer
+    observer.begin(LANES, pixel)
     state = learner.guide and learner.guide.begin(None, None, pixel)
     L, β, active = mi.Float(0), mi.Float(1), mi.Bool(scatters)
     for depth in range(2):
         sample, weight, vertex = numbers.next_2d(), mi.Float(1), vertex_at(depth)
         if learner.guide:
             _, sample, weight, state = learner.guide.draw(state, numbers, vertex, active)
-        learner.direction(vertex, sample, weight, mi.Color3f(L), active)
+        observer.direction(vertex, sample, weight, mi.Color3f(L), active)
         β *= weight
     L += β * brought(pixel, sample)
-    learner.end(mi.Color3f(L))
+    observer.end(mi.Color3f(L))
 
 
 def _learner(kind: type[GuideLearner] = GuideLearner, **changes) -> GuideLearner:
