@@ -132,26 +132,60 @@ def test_one_line_and_equal_points_give_boxes() -> None:
         assert (high > low).all() and np.isfinite(probability).all()
 
 
-def test_pilots_do_not_count_once_they_are_far_noisier(monkeypatch) -> None:
-    """A learner says so before the third stage."""
-    learner = Learner()
-    learner.start = learner.learn = lambda *_: None
-    monkeypatch.setattr(Learner, "__str__", lambda self: "")
-    technique = SimpleNamespace(
-        decision=lambda setting: None, learner=lambda *_: learner, doubles=False,
-        bytes_per_sample=0,
-    )  # fmt: skip
+class _Idle(Learner):
+    """Decides ``name`` in each stage."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.is_finished = name, False
+
+    def start(self, scene, p, n):
+        return self.name
+
+    def learn(self, pilot):
+        return self.name
+
+    def finish(self):
+        self.is_finished = True
+
+    def __str__(self):
+        return ""
+
+
+def _planner(**learners: Learner) -> Planner:
+    techniques = {
+        slot: SimpleNamespace(
+            decision=lambda setting: None, learner=lambda *_, x=learner: x, doubles=False,
+            bytes_per_sample=0,
+        )
+        for slot, learner in learners.items()
+    }  # fmt: skip
     scene = load("cornell_box", width=4, height=4)
     setting = Setting(scene, scene.sensors()[0], 0, 6, 5, 16)
-    planner = Planner(
-        {"scattering": technique}, setting, (1, 1, 2, 12), lambda *_: None, Decisions(),
-        LearningPlan((1, 1, 2)),
-    )  # fmt: skip
-    discards = []
+    return Planner(
+        techniques, setting, (1, 1, 2, 12), lambda *_: None, Decisions(), LearningPlan((1, 1, 2))
+    )
+
+
+def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
+    """A learner says so before the third stage."""
+    learner = _Idle("focal")
+    planner, discards = _planner(scattering=learner), []
     for said in (False, False, True, False):
         learner.discards_pilots = said
         discards.append(planner.next_stage().discards_earlier)
     assert discards == [False, False, True, False]
+
+
+def test_a_learner_replaces_others() -> None:
+    guide, focal = _Idle("guide"), _Idle("focal")
+    planner = _planner(directions=guide, scattering=focal)
+    planner.next_stage()
+    assert planner.decisions.directions == "guide" and not guide.is_finished
+    focal.replaces = ("directions", "flights")
+    for _ in range(3):
+        planner.next_stage()
+        assert planner.decisions.directions is None and planner.decisions.scattering == "focal"
+    assert guide.is_finished and list(planner.learners) == ["scattering"]
 
 
 def _learner(monkeypatch, variance: float, rival: Any = None) -> FocalLearner:
@@ -222,10 +256,12 @@ def test_without_boxes_directions_are_sampled_as_in_path(monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_light_through_a_keyhole_is_found() -> None:
+@pytest.mark.parametrize("integrator", [{"type": "composed_path", "scattering": "focal"},
+                                        {"type": "auto"}], ids=lambda x: x["type"])  # fmt: skip
+def test_light_through_a_keyhole_is_found(integrator: dict) -> None:
     """Directions lead to the keyhole, and the unguided pilots do not count towards the image."""
     scene = load("keyhole", width=64, height=36, rfilter="box")
-    integrator = mi.load_dict({"type": "composed_path", "scattering": "focal", "max_depth": 5})
+    integrator = mi.load_dict({**integrator, "max_depth": 5})
     integrator.render(scene, spp=128, seed=1)
     learner = integrator.learners["scattering"]
     density = learner.decision.density
@@ -234,3 +270,4 @@ def test_light_through_a_keyhole_is_found() -> None:
     weight = np.diff(density.table[0, 1:], prepend=0)
     assert weight[is_near].sum() > 0.5, integrator.statistics.learned
     assert learner.effect.variance < 0.4
+    assert "directions" not in integrator.learners
