@@ -28,7 +28,7 @@ _BOX_LINES, _REGION_LINES = 1 << 11, 1 << 14
 
 #: The lines from which boxes are fitted that only show whether learning is hopeless, and about the
 #: most lines of the paths that show it. With fewer lines than the last number, nothing is known.
-_FEW_LINES, _SHOWING, _TOO_FEW = 1 << 9, 1 << 14, 1 << 6
+_FEW_LINES, _SHOWING, _TOO_FEW = 1 << 9, 1 << 14, 3 << 7
 
 #: The largest weight of a line, relative to the mean.
 _HEAVIEST = 64.0
@@ -47,7 +47,8 @@ class FocalLearner(Learner):
 
     Beside another learner of directions, it draws nothing unless the lines of the first pilot
     predict far less variance: the second pilot then predicts what the boxes of the first one would
-    gain. If that is more than what the other learner gains, focal points take its place.
+    gain. If that is more than what the other learner gains, focal points take its place. Where the
+    first pilots have few lines, it waits for more.
 
     Parameters:
         boxes: The most boxes.
@@ -117,17 +118,18 @@ class FocalLearner(Learner):
         if records is None or self._fitted is None:
             return self.decision
         lines = records.lines()
-        if lines is None:
-            if pilot.is_last:
-                return self._give_up("no path has found light")
-            records.restart()
-            return self.decision
+        count = 0 if lines is None else len(lines.path)
+        if count == 0 and pilot.is_last:
+            return self._give_up("no path has found light")
+        if count == 0 or (count < _TOO_FEW and not self._draws and not pilot.is_last):
+            return self.decision  # until there are more
         bsdf = self._bsdf_density(lines)
         if not (self._is_worth(lines, bsdf, pilot) or self._always):
-            return self._give_up(f"about {max(1 - self._effect.variance, 0):.0%} less variance")
+            less = 0 if self._effect is None else max(1 - self._effect.variance, 0)
+            return self._give_up(f"about {less:.0%} less variance")
         self._fit(lines, bsdf)
         records.restart()
-        if pilot.is_last and self.decision is not None and not self.decision.density.has_boxes:
+        if pilot.is_last and not self._fitted.density.has_boxes:
             # The kernel of path is faster
             self._effect = None
             return self._give_up("the pilots found none")
@@ -165,15 +167,21 @@ class FocalLearner(Learner):
         # All batches have such paths
         is_some = lines.path // BATCHES % dr.opaque(mi.UInt32, stride) == 0
         fits, shows = (dr.compress(is_some & (lines.path % 2 == odd)) for odd in (0, 1))
-        if min(len(fits), len(shows)) < _TOO_FEW:
-            return True
+        if len(lines.path) < _TOO_FEW or not (len(fits) and len(shows)):
+            return self._rival is None  # nothing is known
         some, bsdf_of_some = lines.chosen(fits), dr.gather(mi.Float, bsdf, fits)
         density = self._density(some, bsdf_of_some, _FEW_LINES, _FEW_LINES)
         others, bsdf_of_others = lines.chosen(shows), dr.gather(mi.Float, bsdf, shows)
         focal, path = self._variances(others, bsdf_of_others, density, stride)
         prediction = self._prediction(focal[1::2], path[1::2], density, known=0.0)
-        self._draws |= prediction.variance < verdicts.FAR_LESS
-        return pilot.pays(prediction)
+        if not pilot.pays(prediction):
+            return False
+        is_far_less = prediction.variance < verdicts.FAR_LESS
+        self.discards_pilots = is_far_less and pilot.is_last and not self._draws
+        self._draws = self._draws or is_far_less or (
+            pilot.is_last and prediction.efficiency > self._rival.efficiency
+        )
+        return self._draws or not pilot.is_last
 
     def _prediction(
         self, focal: np.ndarray, path: np.ndarray, density: FocalDensity, known: float

@@ -17,7 +17,7 @@ from mitsuba_ext.techniques.focal_points.decisions import FocalScattering
 from mitsuba_ext.techniques.focal_points.fitting import LineArrays, fitted_boxes, fitted_rows
 from mitsuba_ext.techniques.focal_points.focal_density import FocalDensity
 from mitsuba_ext.techniques.focal_points.learner import FocalLearner
-from mitsuba_ext.techniques.focal_points.line_records import change_of_squares
+from mitsuba_ext.techniques.focal_points.line_records import Lines, change_of_squares
 from mitsuba_ext.transport.decisions import Decisions
 from mitsuba_ext.transport.vertex import Vertex
 from tests.support.statistical import load
@@ -193,8 +193,9 @@ def _learner(monkeypatch, variance: float, rival: Any = None) -> FocalLearner:
     learner = FocalLearner(32, 5, 1.0, 100, (4, 4), rival)
     learner._fitted = FocalScattering(FocalDensity.nothing(2), ALL)
     learner._records = SimpleNamespace(
-        lines=lambda: (), paths=50, restart=lambda: None, stop=lambda: None
-    )
+        lines=lambda: SimpleNamespace(path=range(9999)), paths=50, restart=lambda: None,
+        stop=lambda: None,
+    )  # fmt: skip
     density = FocalDensity(LOW, HIGH, ROWS)
 
     def fit(lines, bsdf):
@@ -232,6 +233,34 @@ def test_focal_points_replace_a_guide_that_is_less_efficient(
     assert (learner.decision is not None) == replaces == ("directions" in learner.replaces)
     assert learner.effect.is_kept == replaces
     assert (learner.efficiency > 1) == replaces
+
+
+@pytest.mark.parametrize("count, through_a_hole, draws", [
+    (2000, True, True), (2000, False, False), (200, True, False),
+])  # fmt: skip
+def test_lines_of_one_pilot_show_whether_there_are_focal_points(
+    count: int, through_a_hole: bool, draws: bool
+) -> None:
+    lines = _lines(count, np.array([2, 0.3, 0.8]), 0.1)
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(np.random.default_rng(1).random((2, count))))
+    found = Lines(
+        mi.Point3f(lines.p.T), mi.Vector3f(lines.d.T) if through_a_hole else d,
+        dr.zeros(mi.UInt32, count), dr.full(mi.Float, 0.2, count), dr.full(mi.Float, 1, count),
+        dr.full(mi.Float, 1, count), dr.arange(mi.UInt32, count), dr.zeros(mi.UInt32, count),
+    )  # fmt: skip
+    learner = FocalLearner(32, 5, 1.0, 10 * count, (4, 4), SimpleNamespace(efficiency=1.5))
+    regions = SimpleNamespace(count=1, levels=[slice(0, 1)], parent=np.zeros(1, int))
+    learner._fitted = FocalScattering(FocalDensity.nothing(1), regions)
+    learner._records = SimpleNamespace(
+        lines=lambda: found, paths=count, variances=np.full(32, count / 32),
+        restart=lambda: None, stop=lambda: None,
+    )  # fmt: skip
+    assert (learner.learn(Pilot(None, False)) is not None) == draws
+    # Few lines decide nothing until the last pilot, which refuses what it cannot know
+    waits = learner._fitted is not None
+    assert waits == (draws or count == 200)
+    learner.learn(Pilot(None, True))
+    assert (learner.decision is not None) == draws == ("directions" in learner.replaces)
 
 
 def test_the_squares_of_paths_with_other_densities() -> None:
