@@ -103,5 +103,5 @@ class AutoPath(WalkIntegrator):
         super().__init__(props)
         techniques, caustics = auto_techniques(self.name), read_slot(self.name, props, "caustics")
         if caustics is not None:
-            del techniques["scattering"]  # these connections know the densities of BSDFs only
+            techniques.pop("scattering", None)  # these connections know the densities of BSDFs only
         self.fill(props, caustics=caustics, **techniques)
