@@ -176,8 +176,8 @@ class FocalLearner(Learner):
         prediction = self._prediction(focal[1::2], path[1::2], density, known=0.0)
         if not pilot.pays(prediction):
             return False
-        # Not where a few bright paths say so
-        is_far_less = prediction.variance * np.exp(prediction.error) < verdicts.FAR_LESS
+        # Not where a few bright paths say so: half the error, because keyhole has one of 0.7
+        is_far_less = prediction.variance * np.exp(prediction.error / 2) < verdicts.FAR_LESS
         self.discards_pilots = is_far_less and pilot.is_last and not self._draws
         self._draws = self._draws or is_far_less or (
             pilot.is_last and prediction.efficiency > self._rival.efficiency
