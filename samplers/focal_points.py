@@ -55,10 +55,11 @@ class FocalPointsPlugin(DecisionPlugin):
     :monosp:`integrator.learners["scattering"].decision.density` has the boxes.
 
     Beside guided directions (:monosp:`directions=guided`), either one or the other is used: focal
-    points, if the first pilot predicts less than 0.4 of the variance, its error included, or if the
-    second one predicts a higher efficiency than it measures for guided directions. With
-    :monosp:`always_use` here, or :monosp:`always_guide` there, both are used together, which is
-    unbiased, and gains little. :class:`auto` and :class:`auto_path` choose in this way.
+    points, if the first pilot predicts less than 0.4 of the variance, half its standard error
+    included, or if the second one predicts a higher efficiency than it measures for guided
+    directions. With :monosp:`always_use` here, or :monosp:`always_guide` there, both are used
+    together, which is unbiased, and gains little. :class:`auto` and :class:`auto_path` choose in
+    this way.
 
     In participating media, paths scatter as in :monosp:`volpath`. Nested in :monosp:`moment`, the
     integrator takes no pilot samples, and nothing is learned.
