@@ -73,9 +73,9 @@ def auto(
     """Self-configuring integrator (auto).
 
     Begins as path, and measures which techniques are worth their time in this scene: guided
-    directions, learned lights, and maps of times, lens points, wavelengths and distances
-    (auto_path); light paths, their number, the number of connections to them, and merging with them
-    (vcm; in participating media, bdpt and sppm).
+    directions or focal points, learned lights, and maps of times, lens points, wavelengths and
+    distances (auto_path); light paths, their number, the number of connections to them, and merging
+    with them (vcm; in participating media, also sppm).
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
@@ -118,10 +118,10 @@ def auto_path(
 ) -> dict[str, Any]:
     """Self-configuring path tracer (auto_path).
 
-    A path tracer that chooses its techniques itself: guided directions, learned lights, and maps of
-    the times, lens points, wavelengths and distances in fog with which paths find light. Its first
-    samples test which of them reduce the noise of this scene by more than they cost, and it keeps
-    those.
+    A path tracer that chooses its techniques itself: guided directions or focal points, learned
+    lights, and maps of the times, lens points, wavelengths and distances in fog with which paths
+    find light. Its first samples test which of them reduce the noise of this scene by more than
+    they cost, and it keeps those.
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
@@ -314,7 +314,7 @@ def composed_prb(
     pilot_spp: int = ...,
     save_learned: str = "",
     load_learned: str = "",
-    learn_every: int = 16,
+    learn_every: int = 32,
     gradient_samples: str = "even",
     max_depth: int = -1,
     rr_depth: int = 5,
@@ -337,11 +337,11 @@ def composed_prb(
         connections (string, int or decision): As in composed_path. (Default: one)
         mis (string or decision): As in composed_path. (Default: power)
         shadow_test (string or decision): As in composed_path. (Default: always)
-        pilot_spp (int): As in composed_path, but up to three quarters of the samples of the first
-            render. (Default: 32 with guided directions, otherwise 16)
+        pilot_spp (int): As in composed_path, but at most a fifth of the samples of the renders that
+            use what is learned. (Default: 32 with guided directions, otherwise 16)
         save_learned, load_learned (string): As in composed_path. (Default: none)
         learn_every (int): Number of renders of a scene after which the next one learns again,
-            because materials and lights may have changed; 0 to learn only once. (Default: 16)
+            because materials and lights may have changed; 0 to learn only once. (Default: 32)
         gradient_samples (string): Samples of the passes for gradients: even, the same number in
             each pixel, or loss, more in pixels on whose values the loss depends most. (Default:
             even)
