@@ -130,11 +130,11 @@ class ComposedPRB(common.RBIntegrator):
     instances have no pairs.
 
     In media, the camera may be in fog, and extinctions may be coloured. Gradients are unbiased
-    where a medium scatters nothing, too: where a grid is empty, and where an extinction or an
-    albedo is 0 (unless the medium has no end). Some paths scatter there for derivatives only, which
-    find the light that a little more would scatter. (:monosp:`prbvolpath` finds only the light that
-    it would absorb: in empty regions, its gradient may have the wrong sign.) Media within
-    instances, which are not accessible, have no such paths.
+    where a medium scatters nothing, too: where a grid is empty, and where an albedo or (unless the
+    medium has no end) an extinction is 0. Some paths scatter there for derivatives only, which find
+    the light that a little more would scatter. (:monosp:`prbvolpath` finds only the light that it
+    would absorb: in empty regions, its gradient may have the wrong sign.) Media within instances,
+    which are not accessible, have no such paths.
 
     Before the first render of a scene, pilot samples are taken, which are not part of the image.
     All renders, and the passes for gradients, use what is learned from them. :monosp:`forget()`

@@ -4,9 +4,8 @@ the functions that ``frozen.py`` records."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -51,7 +50,7 @@ class ReplayedWalk:
     ) -> tuple[Sample, tuple[mi.Spectrum, mi.Spectrum | None]]:
         """The first of two passes along the same paths. Returns its samples, and what each path has
         gathered: all, and behind its detour (``None`` without detours)."""
-        first = FirstPass(self._closest(scene)) if self.flights else None
+        first = FirstPass(self.fills_gaps) if self.flights else None
         sample = self._with(first)(scene, sampler, rays, mi.Bool(active))
         return sample, (sample.L, None) if first is None else (first.L, first.detour_L)
 
@@ -63,14 +62,8 @@ class ReplayedWalk:
         """The second pass, with the random numbers of the first one: propagates derivatives. The
         parameters are as for :class:`~mitsuba_ext.transport.replay.Replay`."""
         L, detour_L = gathered
-        replay = Replay(
-            scene, L, δL, self.flights, self.mirrors, detour_L, self._closest(scene)
-        )  # fmt: skip
+        replay = Replay(scene, L, δL, self.flights, self.mirrors, self.fills_gaps, detour_L)
         return self._with(replay)(scene, sampler, rays, mi.Bool(active)), replay
-
-    def _closest(self, scene: mi.Scene) -> Callable | None:
-        """Finds the surface behind a detour."""
-        return partial(self.walk.query.closest, scene, coherent=False) if self.fills_gaps else None
 
     def _with(self, replay: FirstPass | None) -> Walk:
         walk = self.walk

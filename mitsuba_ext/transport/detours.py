@@ -32,8 +32,12 @@ from .media import vertex_at
 from .transmittance import ratio_tracking, stretch
 from .vertex import FlightEnd
 
-#: Returns the first surface that a ray meets (``mi.PreliminaryIntersection3f``), where ``active``.
-Closest = Callable[..., Any]
+#: Returns the first surface that a ray meets (``mi.PreliminaryIntersection3f``), given the ray and
+#: where it is active.
+Closest = Callable[[Any, Any], Any]
+
+#: In homogeneous media, no detour is longer than this number of mean free paths.
+_FARTHEST = 18.0
 
 
 @dataclass
@@ -113,7 +117,8 @@ def detour_point(
     ends_early = flies & is_homogeneous & ~dr.isfinite(end) & (dr.max(mi.Spectrum(σ)) > 0)
     whole = mi.Ray3f(ray)
     whole.maxt = dr.largest(mi.Float)
-    end = dr.select(ends_early, closest(whole, active=ends_early).t, end)
+    end = dr.select(ends_early, closest(whole, ends_early).t, end)
+    end = dr.minimum(end, _FARTHEST / dr.min(mi.Spectrum(σ)))
     start, length = stretch(medium, ray, end, flies)
     flies &= (length > 0) & ~detour.taken
     # After n flights, 3 / (n + 3) of the paths are left

@@ -19,7 +19,7 @@ class FirstPass:
     random numbers as in the second (:class:`Replay`).
 
     Parameters:
-        closest: Finds surfaces, if paths take detours (``detours.py``); otherwise ``None``.
+        detours: Whether paths take detours (``detours.py``).
 
     Attributes:
         flights: Whether flights through media have derivatives.
@@ -29,13 +29,13 @@ class FirstPass:
 
     flights = True
 
-    def __init__(self, closest: Closest | None = None) -> None:
-        self._closest = closest
+    def __init__(self, detours: bool = False) -> None:
+        self._detours = detours
         self.L, self.detour_L = mi.Spectrum(0), mi.Spectrum(0)
 
     def begin(self) -> Detour | None:
         """The state before the first flight."""
-        if self._closest is None:
+        if not self._detours:
             return None
         return Detour(mi.UInt32(0), mi.Bool(False), mi.Spectrum(0))
 
@@ -46,7 +46,7 @@ class FirstPass:
 
     def flown(
         self, sampler: mi.Sampler, ray: mi.Ray3f, inside: Inside, start: FlightEnd,
-        end: FlightEnd, detour: Detour | None, L: mi.Spectrum, active: mi.Bool,
+        end: FlightEnd, detour: Detour | None, L: mi.Spectrum, active: mi.Bool, closest: Closest,
     ) -> tuple[FlightEnd, Detour | None, mi.Bool]:  # fmt: skip
         """A path has flown along ``ray``, and has gathered ``L`` before.
 
@@ -55,6 +55,7 @@ class FirstPass:
             start: The surface in the direction of the ray, with the throughput at its origin.
             end: The vertex, with the throughput there.
             detour: The state of detours.
+            closest: Finds the surface that another ray from the same vertex would meet.
 
         Returns:
             What a detour changes: the end, the state of detours, and which paths are active.
@@ -62,9 +63,8 @@ class FirstPass:
         point, u = None, sampler.next_1d(active)
         if detour is not None:
             point, detour = detour_point(
-                self._closest, sampler, ray, start.si.t, inside.medium, inside.channel, detour,
-                active,
-            )  # fmt: skip
+                closest, sampler, ray, start.si.t, inside.medium, inside.channel, detour, active
+            )
             detour.L = dr.select(point.chosen, L, detour.L)
         active = self._flown(ray, inside.medium, u, end, point, L, active)
         return end if point is None else point.end(start, end), detour, active
@@ -121,8 +121,8 @@ class Replay(FirstPass):
             mode.
         flights: Whether media have parameters with gradients.
         mirrors: Whether mirrors or smooth glass are optimized.
+        detours: As in the first pass.
         detour_L: What it gathers behind its detour; ``None`` if there are none.
-        closest: As in the first pass.
 
     Attributes:
         derivative: Forward: the derivative of the radiance of each path, once they have ended.
@@ -130,10 +130,9 @@ class Replay(FirstPass):
 
     def __init__(
         self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None, flights: bool = True,
-        mirrors: bool = False, detour_L: mi.Spectrum | None = None,
-        closest: Closest | None = None,
+        mirrors: bool = False, detours: bool = False, detour_L: mi.Spectrum | None = None,
     ) -> None:  # fmt: skip
-        super().__init__(closest)
+        super().__init__(detours)
         self.flights, self._mirrors = flights, mirrors
         self._scene, self._L, self._δL, self._detour_L = scene, L, δL, detour_L
         if δL is None:

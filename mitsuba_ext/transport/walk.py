@@ -12,6 +12,7 @@ its own work, and a default one costs nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -186,8 +187,9 @@ class Walk:
 
             if dr.hint(replays_media, mode="scalar"):
                 end, detour, active = self.replay.flown(
-                    sampler, ray, inside, start, FlightEnd(si, path.β, in_medium), detour, L, active
-                )
+                    sampler, ray, inside, start, FlightEnd(si, path.β, in_medium), detour, L,
+                    active, partial(self._closest, scene, media, path.depth),
+                )  # fmt: skip
                 si, path.β, in_medium = end.si, end.β, end.in_medium
 
             # ----- How much does this vertex emit towards the previous one? -----
@@ -322,9 +324,7 @@ class Walk:
             path.β[rr_active] *= dr.rcp(survival)
 
             ray, inside = media.launch(inside, path.β, sampler, rays, ray, active)
-            pi = self.query.closest(scene, ray, coherent=False, active=active)
-            if dr.hint(media.exist and self.hide_emitters, mode="scalar"):
-                ray, pi = media.behind(self.query, scene, ray, pi, active & (path.depth == 0))
+            pi = self._closest(scene, media, path.depth, ray, active)
             scatter_count += dr.select(active, 1, 0)
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
@@ -347,6 +347,13 @@ class Walk:
         if rays.first is None or media.exist:
             return self.query.closest(scene, ray, coherent=media.coherent, active=active)
         return dr.copy(rays.first)  # the loop of the walk changes it
+
+    def _closest(self, scene, media: NoMedia, depth, ray, active):
+        """The first surface that each path meets, ``depth`` vertices after the camera."""
+        pi = self.query.closest(scene, ray, coherent=False, active=active)
+        if media.exist and self.hide_emitters:
+            _, pi = media.behind(self.query, scene, ray, pi, active & (depth == 0))
+        return pi
 
     def _visit(self, connects: bool, state, scene, si, active):
         """What the next event decision knows about a vertex."""

@@ -11,7 +11,7 @@ import pytest
 
 from mitsuba_ext.transport import replay
 from tests.support.fogs import LIGHTS, cube, fog, fog_around_the_camera, homogeneous
-from tests.support.stage import film, lookat, sensor
+from tests.support.stage import area, film, lookat, rectangle, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -159,6 +159,31 @@ def test_black_fog_has_the_gradient_of_the_light_that_it_would_scatter_once() ->
     way = ((1 - np.sign(d) * p) / abs(d)).min(axis=2)
     expected = np.sum(weights * np.exp(-(1 + x)) * np.exp(-way).mean(axis=0))
     assert dr.grad(parameters[key]).x[0] == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("lamp", [None, "area"])
+def test_black_fog_has_no_end_or_a_hidden_lamp_inside(lamp: str | None) -> None:
+    """Light that is scattered at most once is linear in the albedo."""
+    medium, hidden = {**homogeneous(1.0, 0.0), "id": "fog"}, lamp is not None
+    scene = in_a_furnace(medium)
+    if hidden:
+        place = mi.ScalarTransform4f().translate([0, 0, 0.9]).scale(0.5)
+        scene["lamp"] = rectangle(place, emitter=area(1.0))
+    else:
+        del scene["cloud"], scene["sky"]
+        scene |= {"fog": medium, "point": {"type": "point", "position": [1, 0, 7]}}
+        scene["sensor"]["medium"] = {"type": "ref", "id": "fog"}
+    loaded, parameters = load(scene)
+    (key,) = keys_of(parameters, ".albedo.value.value")
+    settings = {"max_depth": 2, "hide_emitters": hidden}
+    (found,) = backward(loaded, parameters, [key], make(**settings), 1, 4096)
+    means = []
+    for albedo in (0, 1):
+        parameters[key] = type(parameters[key])(albedo)
+        parameters.update()
+        image = mi.render(loaded, integrator=make("composed_path", **settings), seed=2, spp=1024)
+        means.append(float(dr.mean(image * weights(image), axis=None).array[0]))
+    assert found.sum() == pytest.approx(means[1] - means[0], rel=0.1)
 
 
 def test_forward_and_backward_mode_agree() -> None:
