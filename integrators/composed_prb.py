@@ -183,7 +183,7 @@ class ComposedPRB(common.RBIntegrator):
         self.rr_depth = self.path.rr_depth
         self._pixel_count, self._medium = 1, None
         self._flights, self._fills_gaps, self._mirrors = True, False, False
-        self._optimized: frozenset[str] = frozenset()
+        self._told: set[frozenset[str]] = set()
         self._rough: RoughBSDFs | None = None
 
     @property
@@ -265,9 +265,9 @@ class ComposedPRB(common.RBIntegrator):
     def _tell_of_doubts(self, scene, optimized) -> bool:
         """Warns of gradients that are not those of the image, once for each set of parameters.
         Returns whether the set is new."""
-        if optimized == self._optimized:
+        if optimized in self._told:
             return False
-        self._optimized = optimized
+        self._told.add(optimized)
         for sentence in doubtful_gradients(scene):
             mi.Log(mi.LogLevel.Warn, f'"{self.name}": {sentence}.')
         return True

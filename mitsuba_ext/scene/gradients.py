@@ -171,7 +171,7 @@ class RoughBSDFs:
         for shape in scene.shapes():
             bsdf = shape.bsdf()
             α = 0.0 if bsdf is None or _is_diffuse(bsdf) else _optimized_roughness(bsdf)
-            described = str(bsdf)  # with BSDFs that are nested
+            described = str(bsdf) if α > 0 else ""  # with BSDFs that are nested
             if α > 0 and "sample_visible = 0" not in described:
                 is_beckmann = "distribution = beckmann" in described
                 kind = Distribution.BECKMANN if is_beckmann else Distribution.GGX

@@ -215,6 +215,41 @@ def test_a_warning_names_parameters_without_gradients_once(capfd, assigns: bool)
     assert said.count("no sample") == said.count("floor.bsdf.specular") == (not assigns)
 
 
+def test_optimizing_two_sets_of_parameters_in_turns_warns_once(capfd) -> None:
+    scene = mi.load_dict(stage(floor=rectangle(bsdf={"type": "principled", "clearcoat": 0.0})))
+    parameters, integrator = mi.traverse(scene), make()
+    keys = [key for key in parameters.keys() if key.endswith(("clearcoat.value", "color.value"))]
+    assert len(keys) == 2
+    capfd.readouterr()
+    for step in range(4):
+        key = keys[step % 2]
+        dr.enable_grad(parameters[key])
+        parameters.set_dirty(key)
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator, spp=4)))
+        dr.disable_grad(parameters[key])
+    said = capfd.readouterr()
+    assert (said.out + said.err).count("no sample") == 1
+
+
+def test_a_recorded_step_has_the_same_gradient() -> None:
+    scene = mi.load_dict(stage(floor=rectangle(bsdf={"type": "diffuse"})), optimize=False)
+    parameters, integrator = mi.traverse(scene), make()
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+
+    def gradient(value: mi.Float) -> mi.Float:
+        dr.enable_grad(value)
+        parameters[key] = value
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator, spp=4)))
+        return dr.grad(value)
+
+    recorded = dr.freeze(gradient)
+    for value in (0.3, 0.4):
+        found, expected = (f(dr.opaque(mi.Float, value)) for f in (recorded, gradient))
+        assert found[0] == pytest.approx(expected[0], rel=1e-4) and found[0] > 0
+
+
 def test_a_warning_names_blends_with_a_mirror(capfd) -> None:
     blend = {"type": "blendbsdf", "id": "rust", "a": {"type": "diffuse"}, "weight": 0.4,
              "b": {"type": "conductor"}}  # fmt: skip
