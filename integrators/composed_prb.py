@@ -94,7 +94,8 @@ class ComposedPRB(common.RBIntegrator):
        - Longest path in the image, -1 for no limit. (Default: -1)
      * - rr_depth
        - |int|
-       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
+       - Path depth at which Russian roulette on the throughput begins, counted as in :monosp:`prb`:
+         one vertex later than in :class:`composed_path`. (Default: 5)
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: false)
@@ -115,12 +116,13 @@ class ComposedPRB(common.RBIntegrator):
     light of the mirror of a :monosp:`plastic` as light of its diffuse lobe, so that gradients of
     :monosp:`diffuse_reflectance` are biased.)
 
-    The image is the same as with :class:`composed_path`. Derivatives come from tracing the same
+    The image is the same as with :class:`composed_path` if its :monosp:`rr_depth` is one more.
+    Derivatives come from tracing the same
     walk a second time, with the same random numbers: at each vertex, the walk reports the radiance
     that the path has gathered so far, so the rest of its radiance is known. All densities, MIS
     weights and learned maps are treated as constants. With all defaults, and except with respect to
     roughness and of BSDFs such as :monosp:`plastic`, gradients are the same as with :monosp:`prb`,
-    from the same random numbers up to :monosp:`rr_depth`.
+    from the same random numbers.
 
     If the roughness of a conductor, a dielectric or a metallic :monosp:`principled` is optimized,
     samples form pairs where a camera ray meets it, if it is not very rough and not seen at a

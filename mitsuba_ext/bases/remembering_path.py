@@ -25,6 +25,7 @@ from ..transport.decisions import Decisions
 from ..transport.heroes import disperses
 from ..transport.walk import Walk
 from .slots import SLOTS, read_slot
+from .staged_integrator import NO_LIMIT
 from .walk_integrator import WalkIntegrator
 
 #: The decisions that a scene can replace: those that do not change camera rays.
@@ -57,6 +58,8 @@ class RememberingPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        # As in `prb`: from a vertex later than in `path`
+        self.rr_depth = min(self.rr_depth + 1, NO_LIMIT)
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
         for slot, refused in _NOT_DETACHED.items():
             if slot in self.slots and self.slots[slot].name in refused:
@@ -85,7 +88,7 @@ class RememberingPath(WalkIntegrator):
     def common_parameters(self) -> dict[str, Any]:
         known = super().common_parameters()
         del known["aovs"]
-        return known
+        return {**known, "rr_depth": self.rr_depth - 1}
 
     def forget(self) -> None:
         """Learns in the next render, whatever ``learn_every`` is."""
