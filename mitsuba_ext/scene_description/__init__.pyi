@@ -346,7 +346,8 @@ def composed_prb(
             each pixel, or loss, more in pixels on whose values the loss depends most. (Default:
             even)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
-        rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
+        rr_depth (int): Path depth at which Russian roulette on the throughput begins, counted as in
+            prb: one vertex later than in composed_path. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
         timeout (float): Seconds after which a render of the image (not of gradients) ends.
             (Default: -1, none)
