@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ...planning.evidence import TRIM
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...transport.path_decisions import LARGEST_PROBABILITY, unguided_throughput
@@ -24,7 +27,8 @@ class Outcome(NamedTuple):
     """What a way to draw paths gives.
 
     Attributes:
-        variance: Sum over the paths of their squared errors, weighted by pixel.
+        variance: Sum over the paths of their squared errors, weighted by pixel, without the
+            brightest paths of each pass (``evidence.py``).
         segments: The number of segments of all paths.
     """
 
@@ -115,14 +119,19 @@ class RouletteTrial(Observer):
             return
         total = dr.select(dr.isfinite(self._total), self._total, 0)
         weight, error = self._pixels.importance(self._pixel, total)
-        columns = [mi.Float64(error)]
-        for roulette, is_guided in ((False, True), (True, True), (True, False)):
-            more, segments = self._other(total, roulette, is_guided)
-            columns += [mi.Float64(more * weight), mi.Float64(segments)]
+        found = [
+            self._other(total, roulette, is_guided)
+            for roulette, is_guided in ((False, True), (True, True), (True, False))
+        ]
+        squares = [error + more * weight for more, _ in found]
+        dr.eval(squares, found)
+        is_kept = _without_brightest(functools.reduce(dr.maximum, squares))
+        columns = [dr.select(is_kept, mi.Float64(x), 0) for x in squares]
+        columns += [mi.Float64(segments) for _, segments in found]
         # Evaluated together: each of them alone would be a kernel of its own
         dr.eval(columns)
-        error, *sums = joined([dr.sum(x) for x in columns]).numpy().tolist()
-        effects = [Outcome(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
+        sums = joined([dr.sum(x) for x in columns]).numpy().tolist()
+        effects = [Outcome(*sums[i::3]) for i in range(3)]
         self.drawn, self.by_throughput, self.unguided = (
             Outcome(*(x + y for x, y in zip(old, new)))
             for old, new in zip((self.drawn, self.by_throughput, self.unguided), effects)
@@ -157,3 +166,13 @@ class RouletteTrial(Observer):
             throughput = dr.select(goes_on, throughput * ratio, throughput)
         # Ignore squares of large numbers that overflow
         return dr.select(dr.isfinite(more), more, 0), segments
+
+
+def _without_brightest(square: mi.Float) -> mi.Bool:
+    """The paths of a pass without the brightest ones. ``square`` is the largest square that a path
+    has with any way to draw it."""
+    left_out = -(-len(square) // TRIM)
+    if len(square) <= left_out:
+        return mi.Bool(True)
+    most = np.partition(square.numpy(), -left_out - 1)[-left_out - 1]
+    return square <= dr.opaque(mi.Float, float(most))
