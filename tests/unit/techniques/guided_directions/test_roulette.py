@@ -118,9 +118,12 @@ def test_a_region_expects_the_light_of_the_region_around_it() -> None:
 # ---- What it is worth ----
 
 
-def _trial(survival: float, weights: tuple[float, float]) -> RouletteTrial:
+def _trial(
+    survival: float, weights: tuple[float, float], brightest: float | None = None
+) -> RouletteTrial:
     """Paths of two bounces that bring 1 after the second. The first one's number has one of two
-    values of equal probability; the second of them brings nothing. Its density is 1 / weight."""
+    values of equal probability; the second of them brings nothing. Its density is 1 / weight. One
+    path may be the brightest."""
     lanes = 1 << 17
     random = np.random.default_rng(1)
     # Errors are those from the true mean, and count the same everywhere
@@ -145,6 +148,8 @@ def _trial(survival: float, weights: tuple[float, float]) -> RouletteTrial:
         factor, unguided = factor / survival, unguided / survival
     brought = np.where(alive & guided, 2 * factor, 0)
     assert brought.mean() == pytest.approx(1, rel=0.05)
+    if brightest is not None:
+        brought[0] = brightest
     trial.end(mi.Color3f(mi.Float(brought)))
     trial.finish()
     return trial
@@ -162,6 +167,14 @@ def test_the_effects_of_other_roulettes_are_estimated_too(survival: float) -> No
         p = survival if name == "drawn" else 0.8
         assert effect.variance / lanes == pytest.approx(square - 1, rel=0.08), name
         assert effect.segments / lanes == pytest.approx(1 + p + p * p, rel=0.02), name
+
+
+def test_one_bright_path_changes_no_effect() -> None:
+    """It would hide what is gained with all other paths."""
+    usual, bright = (_trial(0.7, (0.6, 3.0), brightest) for brightest in (None, 1e4))
+    for name in ("drawn", "by_throughput", "unguided"):
+        effects = getattr(usual, name), getattr(bright, name)
+        assert effects[1].variance == pytest.approx(effects[0].variance, rel=1e-3), name
 
 
 def test_efficiency_counts_variance_and_segments() -> None:
