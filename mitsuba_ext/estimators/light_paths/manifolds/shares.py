@@ -22,6 +22,7 @@ import mitsuba as mi
 #: Larger numbers of trials are not exact as floats.
 _MOST = 1 << 24
 
+
 def most_trials(ratio: mi.Float, limit: mi.UInt32) -> mi.UInt32:
     """The number of trials that count, at most ``limit``: a chain then lacks up to
     (1 - p)^``limit`` of its light."""
