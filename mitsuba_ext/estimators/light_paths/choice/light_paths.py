@@ -291,7 +291,9 @@ class LightPathTrial(Trial):
     def restore(self, scene: mi.Scene, state: StoredArrays) -> LightPathChoice:
         self._moments = None
         count, connections, *flags = state.take("light_paths", "f", (4,), 0, MOST_TRIED)
-        self._choice = LightPathChoice(Candidate(float(count), int(connections), *map(bool, flags)))
+        techniques = Candidate(float(count), int(connections), *map(bool, flags))
+        state.require(self._has_photons or not techniques.alone, "photons are no candidate here")
+        self._choice = LightPathChoice(techniques)
         return self._choice
 
     @property

@@ -285,13 +285,16 @@ def test_without_boxes_directions_are_sampled_as_in_path(monkeypatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", [{"type": "composed_path", "scattering": "focal"},
-                                        {"type": "auto"}], ids=lambda x: x["type"])  # fmt: skip
+@pytest.mark.parametrize(
+    "integrator",
+    [{"type": "composed_path", "scattering": "focal"}, {"type": "auto_path"}],
+    ids=lambda x: x["type"],
+)
 def test_light_through_a_keyhole_is_found(integrator: dict) -> None:
     """Directions lead to the keyhole, and the unguided pilots do not count towards the image."""
     scene = load("keyhole", width=64, height=36, rfilter="box")
     integrator = mi.load_dict({**integrator, "max_depth": 5})
-    integrator.render(scene, spp=128, seed=1)
+    integrator.render(scene, spp=192, seed=1)
     learner = integrator.learners["scattering"]
     density = learner.decision.density
     middle = (density.low + density.high) / 2
