@@ -265,7 +265,7 @@ class ComposedPRB(common.RBIntegrator):
         return is_new
 
     def _tell_of_doubts(self, scene, optimized) -> bool:
-        """Warns of gradients that are not those of the image, once for each set of parameters.
+        """Warns of gradients that are not the image's own, once for each set of parameters.
         Returns whether the set is new."""
         if optimized in self._told:
             return False

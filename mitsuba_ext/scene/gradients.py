@@ -107,7 +107,7 @@ def optimizes_mirrors(scene: mi.Scene) -> bool:
 
 
 def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
-    """Sentences on BSDFs whose gradients are not, or not all, those of the image."""
+    """Sentences on BSDFs with gradients that differ from the image's own, or are missing."""
     blends, masks, leaves = [], [], []
     for bsdf in all_bsdfs(scene):
         if not _has_mirror(bsdf) or not _is_optimized(bsdf):

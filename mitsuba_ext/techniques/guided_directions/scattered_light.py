@@ -91,7 +91,7 @@ class ScatteredLight:
 
 
 def _cubes(values: np.ndarray) -> np.ndarray:
-    """The table of all cubes: those of a grid of n³ cubes begin at n³."""
+    """The table of all cubes: a grid of n³ cubes begins at n³."""
     cubes, size = np.zeros(2 * _VOXELS, np.float32), RESOLUTION
     cubes[_VOXELS:] = values
     square = np.square(values, dtype=np.float64).reshape([size] * 3)
