@@ -19,6 +19,7 @@ from mitsuba_ext.scene.gradients import (
     doubtful_gradients,
     has_gaps,
     has_roughness,
+    masked_mirrors,
     optimized_parameters,
     optimizes_media,
     optimizes_mirrors,
@@ -101,7 +102,8 @@ class ComposedPRB(common.RBIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - timeout
        - |float|
-       - Seconds after which a render of the image (not of gradients) ends. (Default: -1, none)
+       - Seconds after which a render of the image (not of gradients) ends, learning included.
+         (Default: -1, none)
 
     **Use it when** you optimize materials, textures, lights, environment maps or participating
     media: their albedo, their extinction (:monosp:`sigma_t`; Mitsuba's :monosp:`scale` has no
@@ -183,8 +185,9 @@ class ComposedPRB(common.RBIntegrator):
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
-        self._pixel_count, self._medium = 1, None
-        self._flights, self._fills_gaps, self._mirrors = True, False, False
+        self._pixel_count, self._sensor = 1, None
+        self._flights, self._fills_gaps = True, False
+        self._mirrors, self._masks = False, None
         self._told: set[frozenset[str]] = set()
         self._rough: RoughBSDFs | None = None
 
@@ -233,6 +236,8 @@ class ComposedPRB(common.RBIntegrator):
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         sensor = find_sensor(scene, sensor)
+        if self._follows_loss:
+            self.path.refuse_recording('"gradient_samples": "loss"')
         with in_turn(self, sensor):
             optimized = optimized_parameters(params)
             is_new = self._learn_for(scene, optimized, sensor, seed, spp)
@@ -244,7 +249,7 @@ class ComposedPRB(common.RBIntegrator):
                 else:
                     samples = GradientSamples(PassLanes.of(sensor.film(), spp, 0, None), spp)
                 propagate(
-                    self._replayed(scene), scene, sensor, sampler, seed, samples, grad_in,
+                    self._replayed(scene, sensor), scene, sensor, sampler, seed, samples, grad_in,
                     [*optimized.values()],
                 )  # fmt: skip
             if is_new:
@@ -261,6 +266,7 @@ class ComposedPRB(common.RBIntegrator):
         self._flights = optimizes_media(scene)
         self._fills_gaps = has_gaps(scene)
         self._mirrors = optimizes_mirrors(scene)
+        self._masks = masked_mirrors(scene) if self._mirrors else None
         self._rough = RoughBSDFs.of(scene) if has_roughness(keys) else None
         return is_new
 
@@ -289,7 +295,7 @@ class ComposedPRB(common.RBIntegrator):
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
-        self._pixel_count, self._medium = width * height, sensor.get_medium()
+        self._pixel_count, self._sensor = width * height, sensor
         seed = _opaque(seed)
         sampler, spp = super().prepare(sensor, seed, spp, list(aovs))
         if self._rough is not None:
@@ -299,7 +305,8 @@ class ComposedPRB(common.RBIntegrator):
     def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
         lanes = dr.width(ray)
         pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
-        rays, walk = CameraRays(ray, pixel, medium=self._medium), self._replayed(scene)
+        rays = CameraRays(ray, pixel, medium=self._sensor.get_medium())
+        walk = self._replayed(scene, self._sensor)
         if mode == dr.ADMode.Primal:
             sample, gathered = walk.first(scene, sampler, rays, active)
             return sample.L, sample.valid, [], gathered
@@ -308,10 +315,10 @@ class ComposedPRB(common.RBIntegrator):
         L = sample.L if mode == dr.ADMode.Backward else replay.derivative
         return L, sample.valid, [], None
 
-    def _replayed(self, scene) -> ReplayedWalk:
+    def _replayed(self, scene, sensor) -> ReplayedWalk:
         return ReplayedWalk(
-            self._for_gradients.remembered(scene), self._flights, self._fills_gaps,
-            self._mirrors, self._rough,
+            self._for_gradients.remembered(scene, sensor), self._flights, self._fills_gaps,
+            self._mirrors, self._masks, self._rough,
         )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,9 @@ from .walk_integrator import WalkIntegrator
 
 #: The decisions that a scene can replace: those that do not change camera rays.
 _SLOTS = ("directions", "next_event", "roulette", "flights", "connections", "mis", "shadow_test")
+
+#: The least time for an image after learning, in seconds.
+_LEAST_TIME = 1e-3
 
 #: Decisions whose weights are not radiance / density.
 _NOT_DETACHED = {"next_event": ("resampled_lights", "two_stage_lights"), "directions": ("swarm",)}
@@ -94,19 +98,29 @@ class RememberingPath(WalkIntegrator):
         """Learns in the next render, whatever ``learn_every`` is."""
         self._remembered = None
 
-    def remembered(self, scene: mi.Scene) -> Walk:
+    def remembered(self, scene: mi.Scene, sensor: mi.Sensor) -> Walk:
         """The walk of the last stage of the last render of ``scene``. If there was none, decisions
-        that learn fall back to their defaults."""
+        that learn fall back to their defaults. ``sensor`` sees the scene; it need not be the
+        scene's own."""
         if self._knows(scene):
             return self.walk(self._remembered.decisions)
-        setting = Setting(
-            scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1, plugin=self.name
-        )
+        setting = Setting(scene, sensor, 0, self.max_depth, self.rr_depth, 1, plugin=self.name)
         return self.walk(decisions_of(self.slots, setting, Decisions(query=self.query(scene))))
 
     def _knows(self, scene: mi.Scene) -> bool:
         # Decisions that do not learn are made again: what they depend on may have changed
         return self.can_learn and bool(self._remembered) and self._remembered.scene.is_of(scene)
+
+    def refuse_recording(self, what: str) -> None:
+        """
+        Raises:
+            NotImplementedError: A user records a whole step, and ``what`` needs to read arrays.
+        """
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise NotImplementedError(
+                f'"{self.name}": dr.freeze cannot record a step with {what}: do not freeze it; this '
+                f"integrator records its own kernels"
+            )
 
     @property
     def learned(self) -> object:
@@ -124,9 +138,15 @@ class RememberingPath(WalkIntegrator):
         return 0 < self._interval < self._renders + renders
 
     def render_once(self, request):
+        if self.can_learn:
+            self.refuse_recording("learned decisions")
         if self.can_learn and not self.learned_state.loads(request):
             if self.is_due or not self._knows(request.scene):
+                begin = time.perf_counter()
                 self.learn(request)
+                if request.is_timed:
+                    left = request.timeout - (time.perf_counter() - begin)
+                    request = replace(request, timeout=max(left, _LEAST_TIME))
         return super().render_once(request)
 
     def learn(self, request: Request) -> None:
@@ -134,7 +154,7 @@ class RememberingPath(WalkIntegrator):
         that will use what it learns.
 
         Parameters:
-            request: One of these renders.
+            request: One of these renders. Learning takes at most half of its time.
         """
         self.forget()
         spp = request.spp or request.sensor.sampler().sample_count()
@@ -146,8 +166,9 @@ class RememberingPath(WalkIntegrator):
         # Not the random numbers of the render that uses what is learned
         seed = int((mi.UInt32(request.seed) + 0x9E3779B9)[0])
         of_pilots = replace(
-            request, seed=seed, spp=max(4, samples), develop=False, progress=None, watch=None
-        )
+            request, seed=seed, spp=max(4, samples), timeout=request.timeout / 2, develop=False,
+            progress=None, watch=None,
+        )  # fmt: skip
         if self.plan_learning(of_pilots, of_pilots.spp).pilots:
             with dr.suspend_grad():
                 super().render_once(of_pilots)

@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -177,7 +178,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
         spp = self._checked(scene, spp) or self.default_spp
         self.look_at(scene)
         sensor = camera.find_sensor(scene, sensor)
-        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        if not isinstance(seed, mi.UInt32):
+            seed = operator.index(seed)
+        elif not dr.flag(dr.JitFlag.FreezingScope):  # when no array can be read
+            seed = int(seed[0])
         own = {"timeout": self.timeout, "progress": self.progress, "watch": self.watch}
         known = [field.name for field in fields(Request)]
         for key in wishes:

@@ -31,6 +31,7 @@ class ReplayedWalk:
         flights: Whether flights through media have gradients.
         fills_gaps: Whether media that scatter nothing have gradients (``detours.py``).
         mirrors: Whether mirrors, smooth glass or masks have gradients.
+        masks: Which BSDFs contain masks around mirrors, if any is optimized.
         rough: The BSDFs whose roughness is optimized: lanes form pairs, and samplers are
             :class:`PairedNumbers`. ``None`` if there are none.
     """
@@ -39,6 +40,7 @@ class ReplayedWalk:
     flights: bool = False
     fills_gaps: bool = False
     mirrors: bool = False
+    masks: mi.Bool | None = None
     rough: RoughBSDFs | None = None
 
     def numbers(self, sampler: mi.Sampler, seed: mi.UInt32) -> Numbers:
@@ -62,7 +64,9 @@ class ReplayedWalk:
         """The second pass, with the random numbers of the first one: propagates derivatives. The
         parameters are as for :class:`~mitsuba_ext.transport.replay.Replay`."""
         L, detour_L = gathered
-        replay = Replay(scene, L, δL, self.flights, self.mirrors, self.fills_gaps, detour_L)
+        replay = Replay(
+            scene, L, δL, self.flights, self.mirrors, self.masks, self.fills_gaps, detour_L
+        )
         return self._with(replay)(scene, sampler, rays, mi.Bool(active)), replay
 
     def _with(self, replay: FirstPass | None) -> Walk:

@@ -151,11 +151,12 @@ class Job:
     ) -> None:
         """Seeds a sampler for part ``index``, counted over all passes. The first one is seeded as
         in Mitsuba's own integrators, so that it draws the same numbers."""
-        seed = self.request.seed
+        seed = mi.UInt32(self.request.seed)
         if index > 0:
-            seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
+            seed = mi.sample_tea_32(seed, mi.UInt32(index))[0]
+        dr.make_opaque(seed)
         camera.tell_film(sampler, self.film, getattr(pixels, "start", 0))
-        sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
+        sampler.seed(seed, self._lanes(spp, pixels))
 
     def run(self, interrupt: threading.Event) -> None:
         mi.Log(

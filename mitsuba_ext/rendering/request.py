@@ -33,7 +33,8 @@ class Request:
     no parameter of its integrator.
 
     Attributes:
-        scene, sensor, seed: What is rendered.
+        scene, sensor, seed: What is rendered. The seed is an array while a user records a whole
+            step (``dr.freeze``) with such a seed.
         spp: Samples per pixel; 0 for the number of the sampler.
         develop, evaluate: See ``mi.Integrator.render``.
         timeout: Seconds after which to stop; 0 or less for no limit.
@@ -50,7 +51,7 @@ class Request:
 
     scene: mi.Scene
     sensor: mi.Sensor
-    seed: int = 0
+    seed: int | mi.UInt32 = 0
     spp: int = 0
     develop: bool = True
     evaluate: bool = True

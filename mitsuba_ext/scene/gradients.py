@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..util.arrays import from_numpy
-from .bsdfs import all_bsdfs, contains_bsdf, diffuse_weight
+from .bsdfs import all_bsdfs, bsdf_table, contains_bsdf, diffuse_weight
 from .media import has_instances, may_have_media, scene_media
 from .parameter_values import values_of
 
@@ -65,7 +65,7 @@ def without_gradients(params: Any) -> list[str]:
         return []
     return sorted(
         key for key, value in optimized_parameters(params).items()
-        if not np.any(np.array(dr.grad(value)) != 0)
+        if not dr.any(dr.ravel(dr.grad(value)) != 0)
     )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def has_gaps(scene: mi.Scene) -> bool:
     can_read = not dr.flag(dr.JitFlag.FreezingScope)
     return any(
         key.startswith(("sigma_t", "albedo")) and dr.grad_enabled(value)
-        and (_is_grid(medium, key) or (can_read and np.any(np.array(value) == 0)))
+        and (_is_grid(medium, key) or (can_read and dr.any(dr.ravel(value) == 0)))
         for medium in scene_media(scene)
         for key, value in values_of(mi.traverse(medium))
     )  # fmt: skip
@@ -106,28 +106,41 @@ def optimizes_mirrors(scene: mi.Scene) -> bool:
     return any(bsdf is not None and _has_mirror(bsdf) for bsdf in optimized)
 
 
+def masked_mirrors(scene: mi.Scene) -> mi.Bool | None:
+    """Which BSDFs contain a mask (:func:`bsdf_table`); ``None`` if no mask around a mirror is
+    optimized."""
+    if not any(_is_mirror(bsdf) and _is_optimized(bsdf, "opacity") for bsdf in all_bsdfs(scene)):
+        return None
+    return bsdf_table(scene, ("MaskBSDF",))
+
+
 def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
     """Sentences on BSDFs with gradients that differ from the image's own, or are missing."""
-    blends, masks, leaves = [], [], []
+    blends, panes, leaves, names = [], [], [], _Names(scene)
     for bsdf in all_bsdfs(scene):
         if not _has_mirror(bsdf) or not _is_optimized(bsdf):
             continue
         is_mixed = _is_mirror(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         if is_mixed and contains_bsdf(bsdf, ("BlendBSDF",)):
-            blends.append(bsdf.id())
+            blends += names.of(bsdf)
         if contains_bsdf(bsdf, ("MaskBSDF",)) and _is_optimized(bsdf, "opacity"):
-            (masks if _is_mirror(bsdf) else leaves).append(bsdf.id())
+            leaves += names.of(bsdf, "opacity")
+            if contains_bsdf(bsdf, ("ThinDielectric",)):
+                panes += names.of(bsdf, "opacity")
     if blends:
         yield (
-            f"a blendbsdf that contains a mirror has the wrong brightness in Mitsuba, and its "
-            f"gradients differ from its image: {_listed(blends)}. Blend rough BSDFs instead"
+            f"the gradients of {_listed(blends)} differ from the image: a blendbsdf that contains a "
+            f"mirror has the wrong brightness in Mitsuba. Blend rough BSDFs instead"
         )
-    if masks:
-        yield f"gradients of the opacity of a mask around a mirror are wrong: {_listed(masks)}"
+    if panes:
+        yield (
+            f"the gradients of {_listed(panes)} are wrong if the thindielectric in the mask is "
+            f"optimized, too"
+        )
     if leaves and may_have_media(scene):
         yield (
-            f"in scenes with media, the gradients of the opacity of masks lack the light that "
-            f"reaches a vertex through them: {_listed(leaves)}"
+            f"in scenes with media, the gradients of {_listed(leaves)} lack the light that reaches "
+            f"a vertex through the mask"
         )
 
 
@@ -144,6 +157,30 @@ def _is_mirror(bsdf: mi.BSDF) -> bool:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
+
+
+class _Names:
+    """The names of parameters with gradients, as ``mi.traverse`` prints them."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        parameters = mi.traverse(scene)
+        self._parents = {node.ptr: parent for node, (parent, _) in parameters.hierarchy.items()}
+        self._nodes = {
+            key: node for key, (_, _, node, _) in parameters.properties.items()
+            if dr.grad_enabled(parameters[key])
+        }  # fmt: skip
+
+    def of(self, thing: mi.Object, name: str = "") -> list[str]:
+        """The parameters (of this ``name``) of ``thing``, and of what is nested in it."""
+        return [
+            key for key, node in self._nodes.items()
+            if self._is_within(node, thing) and (not name or name in key.split("."))
+        ]  # fmt: skip
+
+    def _is_within(self, node: mi.Object | None, thing: mi.Object) -> bool:
+        while node is not None and node.ptr != thing.ptr:
+            node = self._parents[node.ptr]
+        return node is not None
 
 
 class RoughBSDFs:
@@ -202,7 +239,7 @@ def _optimized_roughness(bsdf: mi.BSDF) -> float:
     for key, value in values_of(parameters):
         names = _ROUGHNESS & set(key.split("."))
         if names and dr.grad_enabled(value):
-            mean = float(np.mean(np.array(dr.detach(value), np.float64)))
+            mean = float(dr.slice(dr.mean(dr.ravel(dr.detach(value)))))
             largest = max(largest, mean**2 if "roughness" in names else mean)
     return largest
 

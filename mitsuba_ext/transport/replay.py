@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.bsdfs import is_in_table
 from .bsdfs import eval_bsdf, sample_bsdf
 from .detours import Closest, Detour, DetourPoint, detour_point
 from .free_flight import interaction_at
@@ -121,6 +122,7 @@ class Replay(FirstPass):
             mode.
         flights: Whether media have parameters with gradients.
         mirrors: Whether mirrors or smooth glass are optimized.
+        masks: Which BSDFs contain a mask whose opacity is optimized (:func:`bsdf_table`).
         detours: As in the first pass.
         detour_L: What it gathers behind its detour; ``None`` if there are none.
 
@@ -130,10 +132,11 @@ class Replay(FirstPass):
 
     def __init__(
         self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None, flights: bool = True,
-        mirrors: bool = False, detours: bool = False, detour_L: mi.Spectrum | None = None,
+        mirrors: bool = False, masks: mi.Bool | None = None, detours: bool = False,
+        detour_L: mi.Spectrum | None = None,
     ) -> None:  # fmt: skip
         super().__init__(detours)
-        self.flights, self._mirrors = flights, mirrors
+        self.flights, self._mirrors, self._masks = flights, mirrors, masks
         self._scene, self._L, self._δL, self._detour_L = scene, L, δL, detour_L
         if δL is None:
             self._lane = dr.arange(mi.UInt32, dr.width(L))
@@ -197,8 +200,13 @@ class Replay(FirstPass):
                     vertex.bsdf, mi.BSDFContext(), vertex.si, sample_1, sample_2, is_delta
                 )
                 is_null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                passing = vertex.bsdf.eval_null_transmission(vertex.si, is_delta & is_null)
-                value = dr.select(is_null, passing, weight * again.pdf)
+                passing = vertex.bsdf.eval_null_transmission(vertex.si, is_delta)
+                value = weight * again.pdf
+                if self._masks is not None:
+                    # Both the weight and the density have the derivative of the opacity
+                    covered = ~is_null & is_in_table(self._masks, vertex.bsdf)
+                    value /= dr.select(covered, 1 - passing, 1)
+                value = dr.select(is_null, passing, value)
                 self._propagate(dr.select(is_delta, later * dr.relative_grad(value), 0))
 
     def _bsdf(self, vertex: Vertex, d: mi.Vector3f, wo: mi.Vector3f, active: mi.Bool):
