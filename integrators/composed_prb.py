@@ -305,8 +305,10 @@ class ComposedPRB(common.RBIntegrator):
     def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
         lanes = dr.width(ray)
         pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
-        rays = CameraRays(ray, pixel, medium=self._sensor.get_medium())
-        walk = self._replayed(scene, self._sensor)
+        # "moment" calls this without prepare()
+        medium = None if self._sensor is None else self._sensor.get_medium()
+        rays = CameraRays(ray, pixel, medium=medium)
+        walk = self._replayed(scene, self._sensor or scene.sensors()[0])
         if mode == dr.ADMode.Primal:
             sample, gathered = walk.first(scene, sampler, rays, active)
             return sample.L, sample.valid, [], gathered

@@ -118,8 +118,8 @@ class RememberingPath(WalkIntegrator):
         """
         if dr.flag(dr.JitFlag.FreezingScope):
             raise NotImplementedError(
-                f'"{self.name}": dr.freeze cannot record a step with {what}: do not freeze it; this '
-                f"integrator records its own kernels"
+                f'"{self.name}": dr.freeze cannot record a step with {what}: do not freeze it '
+                f"(this integrator records its own kernels)"
             )
 
     @property

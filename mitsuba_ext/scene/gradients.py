@@ -129,8 +129,8 @@ def doubtful_gradients(scene: mi.Scene) -> Iterator[str]:
                 panes += names.of(bsdf, "opacity")
     if blends:
         yield (
-            f"the gradients of {_listed(blends)} differ from the image: a blendbsdf that contains a "
-            f"mirror has the wrong brightness in Mitsuba. Blend rough BSDFs instead"
+            f"the gradients of {_listed(blends)} differ from the image: a blendbsdf that contains "
+            f"a mirror has the wrong brightness in Mitsuba. Blend rough BSDFs instead"
         )
     if panes:
         yield (
@@ -166,8 +166,8 @@ class _Names:
         parameters = mi.traverse(scene)
         self._parents = {node.ptr: parent for node, (parent, _) in parameters.hierarchy.items()}
         self._nodes = {
-            key: node for key, (_, _, node, _) in parameters.properties.items()
-            if dr.grad_enabled(parameters[key])
+            key: parameters.properties[key][2] for key, value in values_of(parameters)
+            if dr.grad_enabled(value)
         }  # fmt: skip
 
     def of(self, thing: mi.Object, name: str = "") -> list[str]:
