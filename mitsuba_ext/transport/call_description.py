@@ -17,6 +17,10 @@ VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 #: Sensors of Mitsuba 3.9.1 that hold arrays but do not report them to Dr.Jit.
 SENSORS_WITH_HIDDEN_ARRAYS = frozenset({"ThinLensCamera", "OrthographicCamera"})
 
+#: Reconstruction filters that are known by their radius.
+_FILTERS = frozenset({"BoxFilter", "TentFilter", "GaussianFilter", "CatmullRomFilter",
+                      "LanczosSincFilter"})  # fmt: skip
+
 
 class UndescribedError(Exception):
     """An argument cannot be compared with the same argument of an earlier call. The message names
@@ -26,6 +30,29 @@ class UndescribedError(Exception):
 def address(thing: mi.Object) -> int:
     """Names an object of Mitsuba while it lives."""
     return thing.ptr
+
+
+def sensor_name(sensor: mi.Sensor) -> Any:
+    """What kernels depend on besides the parameters of a sensor. Perspective cameras with equal
+    films share recordings, because an optimization may have one camera for each of a hundred
+    photographs. Other sensors are named by their address."""
+    film = sensor.film()
+    kinds = sensor.class_name(), film.class_name()
+    if (
+        kinds != ("PerspectiveCamera", "HDRFilm")
+        or sensor.get_medium() is not None
+        or film.rfilter().class_name() not in _FILTERS
+    ):
+        return address(sensor)
+    shutter = sensor.shutter_open(), sensor.shutter_open_time()
+    return *kinds, str(film), filter_name(film.rfilter()), *shutter
+
+
+def filter_name(rfilter: mi.ReconstructionFilter) -> Any:
+    """Distinguishes reconstruction filters."""
+    if rfilter.class_name() in _FILTERS:
+        return rfilter.class_name(), rfilter.radius()
+    return address(rfilter)
 
 
 class CallDescription:
@@ -126,10 +153,10 @@ class CallDescription:
             return (
                 type(thing), tuple(thing.size()), tuple(thing.offset()), thing.channel_count(),
                 thing.coalesce(), thing.normalize(), thing.border_size(),
-                address(thing.rfilter()) if thing.rfilter() is not None else None,
+                filter_name(thing.rfilter()) if thing.rfilter() is not None else None,
                 thing.warn_negative(), thing.warn_invalid(),
             )  # fmt: skip
-        name = address(thing)
-        if name not in self._own:
+        name = sensor_name(thing) if isinstance(thing, mi.Sensor) else address(thing)
+        if isinstance(name, int) and name not in self._own:
             self.held[name] = thing
         return type(thing), name

@@ -59,7 +59,7 @@ from ..scene.mark import SceneMark
 from ..scene.parameter_values import values_of
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
-from .call_description import VALUES, CallDescription, UndescribedError, address
+from .call_description import VALUES, CallDescription, UndescribedError, address, sensor_name
 
 #: The largest number of scenes whose recordings are kept, and of recordings of each scene.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
@@ -266,12 +266,13 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
         value for node in nodes if isinstance(node, mi.PhaseFunction) or _is_raw(node)
         for _, value in values_of(mi.traverse(node)) if dr.is_jit_v(value)
     ]  # fmt: skip
+    name = sensor_name(sensor)
     values = (
-        threads, address(sensor), _values(parameters), _values(mi.traverse(sensor)),
+        threads, name, _values(parameters), _values(mi.traverse(sensor)),
         tuple(map(_literals, hidden)),
     )  # fmt: skip
-    if address(sensor) not in own:
-        kept.held[address(sensor)] = sensor
+    if isinstance(name, int) and name not in own:
+        kept.held[name] = sensor
     return _Current(kept, scene, values, own, hidden)
 
 

@@ -15,7 +15,7 @@ import pytest
 from mitsuba_ext.rendering.render import Job
 from mitsuba_ext.transport import call_description, frozen
 from mitsuba_ext.transport.walk import Walk
-from tests.support.stage import area, sensor, stage
+from tests.support.stage import area, lookat, sensor, stage
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -272,6 +272,23 @@ def test_changes_of_a_phase_function_are_seen(opaque: bool) -> None:
         after = _image(scene, integrator)
         _assert_same(after, _traced(scene, integrator))
         assert np.abs(after - before).max() > 0.01 * before.mean()
+
+
+@pytest.mark.parametrize("name", ["composed_path", "bdpt"])
+def test_perspective_cameras_with_equal_films_share_recordings(name: str) -> None:
+    """An optimization may have a camera for each of a hundred photographs."""
+    scene, integrator = _scene(), mi.load_dict({"type": name, "max_depth": 3})
+    views = [([0, -4, 1.2], {}), ([2, -3, 1], {"fov": 30}), ([1, -4, 2], {"near_clip": 3.0})]
+    counts = []
+    for origin, more in views:
+        view = lookat(origin, [0, 0, 0.6], [0, 0, 1])
+        camera = mi.load_dict(sensor(to_world=view, **more))
+        found = np.array(mi.render(scene, sensor=camera, integrator=integrator, seed=1, spp=8))
+        counts.append(len(_recorded()))
+        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+            again = mi.render(scene, sensor=camera, integrator=integrator, seed=1, spp=8)
+        _assert_same(found, np.array(again))
+    assert counts[0] == counts[1] < counts[2]
 
 
 def test_scenes_that_share_their_sensor_are_two() -> None:
