@@ -1,20 +1,21 @@
 """How well are a million parameters recovered, compared with ``prb``? The textures of two rooms,
 roughness, five lamps and an environment map, from 16 photographs.
 
-    python benchmarks/textured_room.py --seconds 120
+    python benchmarks/textured_room.py --seconds 40
 
 Each surface has a texture of its own. The photographs, of 96x54 pixels, are rendered by ``path``.
-Each step shows one of them (or all, with ``--batch``), and Adam moves all parameters, beginning
-with grey textures and lamps of the same radiance. All integrators get the same processor time (of
-all cores; compilation and learning included).
+Each step renders one of them, and Adam moves all parameters, beginning with grey textures and lamps
+of the same radiance. A texture is the sum of three levels of detail. All integrators get the same
+processor time (of all cores; compilation and learning included).
 
 Albedo: the mean error of the albedo of texels that are seen in a photograph. Roughness: the same.
 Lamps: the mean error of the logarithms of their radiance. Sky: the mean error of its pixels.
-Memory: the most that the process has held until then.
+Memory: the most that the process has held until then, photographs included.
 """
 
 from __future__ import annotations
 
+import itertools
 import resource
 import time
 from collections.abc import Iterator
@@ -28,22 +29,28 @@ import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
 
-
-_COMPOSED = {"type": "composed_prb", "next_event": "contribution"}
+_COMPOSED = {"type": "composed_prb", "max_depth": 6, "next_event": "contribution"}
 
 INTEGRATORS = {
-    "prb": {"type": "prb"},
-    "defaults": {"type": "composed_prb"},
+    "prb": {"type": "prb", "max_depth": 6},
+    "defaults": {"type": "composed_prb", "max_depth": 6},
     "lights": _COMPOSED,
+    "guide": {**_COMPOSED, "directions": "guided"},
     "loss": {**_COMPOSED, "gradient_samples": "loss"},
     "control": {"type": "control_variate", "nested": {**_COMPOSED, "learn_every": 0}},
 }
 
-#: Texels along the sides of textures and of the sky, and the depth of paths.
-_TEXTURE, _SKY, _MAX_DEPTH = 112, (64, 128), 6
+#: Texels along the sides of textures and of the sky.
+_TEXTURE, _SKY = 112, (64, 128)
 
-#: The learning rates of roughness, lamps and sky, relative to the rate of the albedo.
-_RATES = {"alpha": 1.0, "radiance": 1.0, "sky": 1.0}
+#: The learning rates, relative to the rate of the albedo. Lamps have the longest way to go.
+_RATES = {"albedo": 1.0, "roughness": 0.3, "lamps": 10.0, "sky": 5.0}
+
+#: The values of each kind.
+_LIMITS = {"albedo": (0.02, 0.98), "roughness": (0.02, 0.98), "sky": (0.01, 10.0)}
+
+#: Widths of the texels of the levels of detail.
+_LEVELS = 16, 4, 1
 
 
 def _noise(shape: tuple[int, int], low: float, high: float, seed: int) -> np.ndarray:
@@ -162,23 +169,65 @@ def cameras(size: tuple[int, int]) -> list[dict]:
     return found
 
 
+def kind_of(key: str) -> str:
+    """What a parameter is."""
+    if key.endswith("radiance.value"):
+        return "lamps"
+    return "sky" if key.startswith("sky") else "roughness" if "roughness" in key else "albedo"
+
+
+class Unknown:
+    """A parameter that is recovered.
+
+    Parameters:
+        key: Its name.
+        truth: Its true value.
+        optimizer: What optimizes it.
+        rate: The learning rate of the albedo.
+    """
+
+    def __init__(self, key: str, truth, optimizer: mi.ad.Adam, rate: float) -> None:
+        self.kind, self._shape, self._optimizer = kind_of(key), truth.shape, optimizer
+        self._start = {"lamps": 10.0, "sky": 1.0}.get(self.kind, 0.4)
+        self._levels = {key: None}
+        if self.kind == "lamps":
+            optimizer[key] = mi.Color3f(np.log(self._start))
+        else:
+            height, width, channels = self._shape
+            self._levels = {
+                f"{key}, {size}": (height // size, width // size, channels) for size in _LEVELS
+            }
+            for level, shape in self._levels.items():
+                optimizer[level] = dr.zeros(mi.TensorXf, shape)
+        for level in self._levels:
+            optimizer.set_learning_rate({level: rate * _RATES[self.kind]})
+
+    @property
+    def value(self):
+        """Its present value."""
+        if self.kind == "lamps":
+            (key,) = self._levels
+            return dr.exp(self._optimizer[key])
+        total = mi.TensorXf(self._start)
+        for level, shape in self._levels.items():
+            detail = self._optimizer[level]
+            is_finest = shape == self._shape
+            total = total + (detail if is_finest else dr.resample(detail, self._shape, "linear"))
+        return dr.clip(total, *_LIMITS[self.kind])
+
+
 class Recovery:
     """The task: the scene, its photographs, and what is recovered."""
 
-    def __init__(self, size: tuple[int, int], is_batch: bool) -> None:
+    def __init__(self, size: tuple[int, int]) -> None:
         self.scene = mi.load_dict(Room().described, optimize=False)
         self.parameters = mi.traverse(self.scene)
         self.truth = {
             key: type(value)(value) for key, value in self.parameters
             if key.endswith((".data", "radiance.value"))
         }  # fmt: skip
-        views = cameras(size)
-        if is_batch:
-            film = {**views[0]["film"], "width": size[0] * len(views)}
-            each = {f"view{i}": view for i, view in enumerate(views)}
-            views = [{"type": "batch", "film": film, **each}]
-        self.sensors = [mi.load_dict(view) for view in views]
-        path = mi.load_dict({"type": "path", "max_depth": _MAX_DEPTH})
+        self.sensors = [mi.load_dict(view) for view in cameras(size)]
+        path = mi.load_dict({"type": "path", "max_depth": 6})
         self.photographs = [
             mi.render(self.scene, sensor=sensor, integrator=path, spp=512, seed=1000 + i)
             for i, sensor in enumerate(self.sensors)
@@ -188,112 +237,87 @@ class Recovery:
 
     def _find_seen(self) -> dict[str, np.ndarray]:
         """Whether each texel is seen in a photograph."""
-        keys = [key for key in self.truth if key.startswith("surface") and key.endswith(".data")]
+        keys = [key for key in self.truth if kind_of(key) == "albedo"]
         for key in keys:
             dr.enable_grad(self.parameters[key])
             self.parameters.set_dirty(key)
         self.parameters.update()
         colours = mi.load_dict({"type": "aov", "aovs": "a:albedo"})
         for sensor in self.sensors:
-            image = mi.render(self.scene, self.parameters, sensor=sensor, integrator=colours, spp=64)
+            image = mi.render(self.scene, self.parameters, sensor, colours, spp=64)
             dr.backward(dr.sum(image, axis=None))
         seen = {key: np.array(dr.grad(self.parameters[key])).any(axis=2) for key in keys}
-        for key in keys:
-            rough = key.replace("roughness", "base_color")
-            seen[key] = seen[rough]
-            self.parameters[key] = self.truth[key]
-        self.parameters.update()
-        return seen
+        self._reset()
+        return seen | {key.replace("base_color", "roughness"): x for key, x in seen.items()}
 
-    def run(self, plugin: dict, seconds: float, rate: float, spp: int, seed: int) -> Iterator[tuple]:
-        """The time after each step, and the errors."""
-        nested = plugin.get("nested")
-        plugin = {**plugin, "max_depth": _MAX_DEPTH} if nested is None else {
-            **plugin, "nested": {**nested, "max_depth": _MAX_DEPTH}}
-        integrator, optimizer = mi.load_dict(plugin), mi.ad.Adam(lr=rate)
+    def _reset(self) -> None:
         for key, value in self.truth.items():
-            optimizer[key] = self._start(key, value)
-        order, spent, step = np.random.default_rng(seed), 0.0, 0
+            self.parameters[key] = value
+        self.parameters.update()
+
+    def run(self, plugin: dict, seconds: float, rate: float, spp: int) -> Iterator[tuple]:
+        """The time after each step, and a function that returns the errors."""
+        integrator, optimizer = mi.load_dict(plugin), mi.ad.Adam(lr=rate)
+        unknowns = {k: Unknown(k, truth, optimizer, rate) for k, truth in self.truth.items()}
+        order, spent, step = np.random.default_rng(0), 0.0, 0
         while spent < seconds:
             begin = time.process_time()
             if step % len(self.sensors) == 0:
                 turns = order.permutation(len(self.sensors))
             view = int(turns[step % len(self.sensors)])
-            for key in self.truth:
-                self.parameters[key] = self._value(optimizer, key)
+            for key, unknown in unknowns.items():
+                self.parameters[key] = unknown.value
             self.parameters.update()
             image = mi.render(
-                self.scene, self.parameters, sensor=self.sensors[view], integrator=integrator,
-                seed=seed + step, spp=spp,
-            )  # fmt: skip
+                self.scene, self.parameters, self.sensors[view], integrator, seed=step, spp=spp
+            )
             target = self.photographs[view]
             loss = dr.mean(dr.square((image - target) / (target + 0.01)), axis=None)
             dr.backward(loss)
             optimizer.step()
-            for key in self.truth:
-                if not _is_logarithm(key):
-                    low, high = (0.01, 10) if key.startswith("sky") else (0.02, 0.98)
-                    optimizer[key] = dr.clip(optimizer[key], low, high)
             dr.eval(optimizer)
             dr.sync_thread()
             spent += time.process_time() - begin
             step += 1
-            yield spent, lambda: self._errors(optimizer)
-        for key, value in self.truth.items():
-            self.parameters[key] = value
-        self.parameters.update()
+            yield spent, lambda: self._errors(unknowns)
+        self._reset()
 
-    def _start(self, key: str, truth):
-        if _is_logarithm(key):
-            return dr.log(mi.Color3f(10))
-        return dr.full(mi.TensorXf, 1.0 if key.startswith("sky") else 0.4, truth.shape)
-
-    def _value(self, optimizer: mi.ad.Adam, key: str):
-        return dr.exp(optimizer[key]) if _is_logarithm(key) else optimizer[key]
-
-    def _errors(self, optimizer: mi.ad.Adam) -> dict[str, float]:
-        sums: dict[str, list[np.ndarray]] = {}
-        for key, truth in self.truth.items():
-            found, truth = np.array(dr.detach(optimizer[key])), np.array(truth)
-            if _is_logarithm(key):
-                truth = np.log(truth)
-            difference = np.abs(found - truth)
-            if key in self._seen:
-                difference = difference[self._seen[key]]
-            kind = "roughness" if "roughness" in key else "sky" if key.startswith("sky") else (
-                "lamps" if _is_logarithm(key) else "albedo")
-            sums.setdefault(kind, []).append(difference.ravel())
-        return {kind: float(np.concatenate(each).mean()) for kind, each in sums.items()}
-
-
-def _is_logarithm(key: str) -> bool:
-    return key.endswith("radiance.value")
+    def _errors(self, unknowns: dict[str, Unknown]) -> dict[str, float]:
+        differences: dict[str, list[np.ndarray]] = {}
+        for key, unknown in unknowns.items():
+            found, truth = np.array(dr.detach(unknown.value)), np.array(self.truth[key])
+            if unknown.kind == "lamps":
+                found, truth = np.log(found), np.log(truth)
+            difference = np.abs(found - truth)[self._seen.get(key, ...)]
+            differences.setdefault(unknown.kind, []).append(difference.ravel())
+        return {kind: float(np.concatenate(x).mean()) for kind, x in differences.items()}
 
 
 @click.command()
-@click.option("--seconds", default=120.0, show_default=True, help="Of each optimization.")
+@click.option("--seconds", default=40.0, show_default=True, help="Of each optimization.")
 @click.option("--size", default=(96, 54), type=(int, int), show_default=True)
 @click.option("--spp", default=4, show_default=True, help="Samples per pixel of a step.")
-@click.option("--batch", "is_batch", is_flag=True, help="All photographs in each step.")
-@click.option("--rate", "rates", multiple=True, default=(0.02,), show_default=True, type=float)
+@click.option("--rate", "rates", multiple=True, default=(0.005,), show_default=True, type=float,
+              help="The learning rate of the albedo.")
 @click.option("--integrator", "names", multiple=True, default=("prb", "lights"), show_default=True,
               type=click.Choice(list(INTEGRATORS)))
-def main(seconds, size, spp, is_batch, rates, names) -> None:
+def main(seconds, size, spp, rates, names) -> None:
     """Runs the optimization with each integrator and each learning rate."""
     mi.set_variant("llvm_ad_rgb")
-    recovery = Recovery(size, is_batch)
+    recovery = Recovery(size)
     count = sum(int(np.prod(np.array(value).shape)) for value in recovery.truth.values())
     print(f"{count} parameters", flush=True)
-    for rate in rates:
-        for name in names:
-            steps, next_print = 0, seconds / 8
-            for spent, errors in recovery.run(INTEGRATORS[name], seconds, rate, spp, 0):
-                steps += 1
-                if spent >= next_print:
-                    next_print += seconds / 8
-                    listed = ", ".join(f"{kind} {x:.4f}" for kind, x in errors().items())
-                    print(f"{name}, rate {rate}: {spent:.0f} s, {steps} steps: {listed}", flush=True)
-            print(f"    {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB", flush=True)
+    for rate, name in itertools.product(rates, names):
+        report = seconds / 4
+        for step, (spent, errors) in enumerate(
+            recovery.run(INTEGRATORS[name], seconds, rate, spp), 1
+        ):
+            if spent >= report:
+                report += seconds / 4
+                listed = ", ".join(f"{kind} {x:.4f}" for kind, x in errors().items())
+                print(f"{name}, rate {rate}: {spent:.0f} s, {step} steps: {listed}", flush=True)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(f"    {peak / 1024:.0f} MiB", flush=True)
 
 
 if __name__ == "__main__":

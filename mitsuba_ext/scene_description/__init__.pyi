@@ -349,8 +349,8 @@ def composed_prb(
         rr_depth (int): Path depth at which Russian roulette on the throughput begins, counted as in
             prb: one vertex later than in composed_path. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)
-        timeout (float): Seconds after which a render of the image (not of gradients) ends.
-            (Default: -1, none)
+        timeout (float): Seconds after which a render of the image (not of gradients) ends, learning
+            included. (Default: -1, none)
     """
 
 
