@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,8 +14,10 @@ from mitsuba_ext.bases.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import PassLanes, film_extent, find_sensor
 from mitsuba_ext.rendering.gradient_pass import GradientSamples, ReplayedWalk, propagate
 from mitsuba_ext.rendering.loss_samples import loss_samples
+from mitsuba_ext.rendering.pixel_sensitivity import PixelSensitivity
 from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import (
+    Optimized,
     RoughBSDFs,
     doubtful_gradients,
     has_gaps,
@@ -26,12 +29,21 @@ from mitsuba_ext.scene.gradients import (
     refuse_geometry,
     without_gradients,
 )
+from mitsuba_ext.scene.mark import SceneMark
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.mirrored_directions import PairedNumbers
+from mitsuba_ext.transport.sensitivity import Sensitivity
 
 # Mitsuba executes this module again for each variant, but perhaps not yet for this one
 common = importlib.reload(common)
+
+#: The most views of which it is remembered where derivatives come from, and the fewest samples of a
+#: pixel that tell it.
+_MOST_VIEWS, _LEAST_SPP = 64, 8
+
+#: From this number and the seed of a pass, the seed of its measurement is derived.
+_OF_VIEWS = 0x3C6EF372
 
 
 @registry.plugin
@@ -87,9 +99,10 @@ class ComposedPRB(common.RBIntegrator):
      * - gradient_samples
        - |string|
        - Samples of the passes for gradients: :monosp:`even`, the same number in each pixel, or
-         :monosp:`loss`, more in pixels on whose values the loss depends most. With
-         :monosp:`loss`, pixels that a mask removes from the loss get none, and the others get
-         their samples. (Default: even)
+         :monosp:`loss`, more in pixels where the derivative of the loss is large: the loss
+         depends on them, and they depend on what is optimized. The latter is measured in the passes
+         1, 2, 4, 8 and so on, by at least eight samples per pixel. Pixels that a mask removes from
+         the loss get none. (Default: even)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. (Default: -1)
@@ -189,6 +202,7 @@ class ComposedPRB(common.RBIntegrator):
         self._flights, self._fills_gaps = True, False
         self._mirrors, self._masks = False, None
         self._told: set[frozenset[str]] = set()
+        self._views: dict[tuple, PixelSensitivity] = {}
         self._rough: RoughBSDFs | None = None
 
     @property
@@ -222,6 +236,7 @@ class ComposedPRB(common.RBIntegrator):
         """Learns again in the next render."""
         self.path.forget()
         self._sensitive.forget()
+        self._views.clear()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = find_sensor(scene, sensor)
@@ -241,11 +256,12 @@ class ComposedPRB(common.RBIntegrator):
         with in_turn(self, sensor):
             optimized = optimized_parameters(params)
             is_new = self._learn_for(scene, optimized, sensor, seed, spp)
+            view = self._view(scene, optimized, sensor, seed, spp) if self._follows_loss else None
             with dr.suspend_grad():
                 seed = _opaque(seed)
                 sampler, spp = super().prepare(sensor, seed, spp)
-                if self._follows_loss:
-                    samples = loss_samples(sensor, spp, grad_in, int(seed[0]))
+                if view is not None:
+                    samples = loss_samples(sensor, spp, grad_in, int(seed[0]), view.mean)
                 else:
                     samples = GradientSamples(PassLanes.of(sensor.film(), spp, 0, None), spp)
                 propagate(
@@ -269,6 +285,24 @@ class ComposedPRB(common.RBIntegrator):
         self._masks = masked_mirrors(scene) if self._mirrors else None
         self._rough = RoughBSDFs.of(scene) if has_roughness(keys) else None
         return is_new
+
+    def _view(self, scene, optimized, sensor, seed, spp) -> PixelSensitivity:
+        """Where in the image of a sensor derivatives come from."""
+        key = SceneMark(scene).index, sensor.ptr, film_extent(sensor.film()), *sorted(optimized)
+        view = self._views.pop(key, None) or PixelSensitivity()
+        if view.is_due():
+            walk = self._for_gradients.remembered(scene)
+            walk = replace(walk, program=Sensitivity(Optimized(scene)))
+            with dr.suspend_grad():
+                # Not the random numbers of the pass for gradients
+                seed = mi.sample_tea_32(mi.UInt32(seed), _OF_VIEWS)[0]
+                spp = max(spp or sensor.sampler().sample_count(), _LEAST_SPP)
+                sampler, spp = super().prepare(sensor, seed, spp)
+                view.measure(walk, scene, sensor, sampler, spp)
+        self._views[key] = view
+        if len(self._views) > _MOST_VIEWS:
+            del self._views[next(iter(self._views))]
+        return view
 
     def _tell_of_doubts(self, scene, optimized) -> bool:
         """Warns of gradients that are not the image's own, once for each set of parameters.
