@@ -4,7 +4,7 @@
 
 Each task recovers parameters of a scene from one picture of it, by Adam: colours, lamps, a
 painting, roughness, an environment map, fog. All integrators take as many samples, have the same
-learning rates, and get the same processor time (of all cores; compilation and learning included).
+learning rates, and get the same processor time (of all cores; learning included, kernels from the cache on disk).
 In fog, ``prbvolpath`` stands for ``prb``.
 
 Error: the mean over the parameters, of their difference to the true ones (of their logarithms for
@@ -157,7 +157,10 @@ class Recovery:
         self, plugins: dict[str, dict], seconds: float, rates: tuple[float, ...], seeds: int
     ) -> dict[str, list[list[tuple]]]:
         """For each plugin, a run with each of the seeds, with the best of the learning rates.
-        Plugins take turns, because the load of the machine changes."""
+        Plugins take turns, because the load of the machine changes. A short run of each one comes
+        first, which compiles."""
+        for plugin in plugins.values():
+            self.run(plugin, 1.0, rates[0], 0)
         found = {(name, rate): [] for name in plugins for rate in rates}
         for seed in range(seeds):
             for name, rate in found:

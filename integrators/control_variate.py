@@ -39,8 +39,14 @@ class ControlVariate(mi.AdjointIntegrator):
          (Default: 64)
      * - (Nested plugin)
        - |integrator|
-       - The integrator to render with, exactly one: :monosp:`composed_prb`, :monosp:`prb`,
+       - The integrator to render with, at most one: :monosp:`composed_prb`, :monosp:`prb`,
          :monosp:`prbvolpath`, :monosp:`direct_projective`, or another one that computes gradients.
+         (Default: :monosp:`composed_prb` with :monosp:`next_event` = :monosp:`contribution` and
+         :monosp:`gradient_samples` = :monosp:`loss`)
+     * - max_depth, rr_depth, hide_emitters
+       - |int|, |int|, |bool|
+       - Parameters of the default integrator, accepted only without a nested one. (Default: as in
+         :monosp:`composed_prb`)
 
     **Use it when** you optimize with few samples in each step, and parameters change by a few
     percent. **Not when** noise does not matter, or parameters change a lot from step to step: each
@@ -84,18 +90,13 @@ class ControlVariate(mi.AdjointIntegrator):
         .. code-tab:: xml
 
             <integrator type="control_variate">
-                <integrator type="composed_prb">
-                    <integer name="max_depth" value="6"/>
-                </integrator>
+                <integer name="max_depth" value="6"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'control_variate',
-            'nested': {
-                'type': 'composed_prb',
-                'max_depth': 6
-            }
+            'max_depth': 6
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -107,16 +108,16 @@ class ControlVariate(mi.AdjointIntegrator):
         self.forget()
 
     def _nested(self, props: mi.Properties) -> mi.Integrator:
-        children = [child for _, child in props.objects()]
+        children = [child for _, child in props.objects()] or [_default(props)]
         # type(self), because the name is another class once another variant is selected
         if (
             len(children) != 1
             or not isinstance(children[0], mi.Integrator)
             or isinstance(children[0], type(self))
         ):
-            found = ", ".join(child.class_name() for child in children) or "none"
+            found = ", ".join(child.class_name() for child in children)
             raise ValueError(
-                f'"{self.name}": exactly one integrator that computes gradients, such as '
+                f'"{self.name}": at most one integrator that computes gradients, such as '
                 f'"composed_prb" or "prb", must be nested in it; found {found}'
             )
         nested = children[0]
@@ -206,6 +207,16 @@ class ControlVariate(mi.AdjointIntegrator):
 #: The second number from which the seed of the next step is derived. Mitsuba derives seeds for
 #: gradients from 1.
 _NEXT = 0x637626C5
+
+
+def _default(props: mi.Properties) -> mi.Integrator:
+    """The integrator that is nested if the scene names none."""
+    nested = mi.Properties("composed_prb")
+    nested["next_event"], nested["gradient_samples"] = "contribution", "loss"
+    for key in ("max_depth", "rr_depth", "hide_emitters"):
+        if key in props:
+            nested[key] = props[key]
+    return mi.PluginManager.instance().create_object(nested)
 
 
 class _View:

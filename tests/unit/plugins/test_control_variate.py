@@ -258,9 +258,9 @@ def test_what_cannot_work_is_refused() -> None:
         wrapped().render(scene, sensor=1)
     learns = plain("composed_prb", next_event="contribution", learn_every=2)
     for parameters, message in (
-        ({}, "exactly one integrator .* found none"),
-        ({"a": plain(), "b": plain()}, "exactly one integrator"),
-        ({"a": {"type": "control_variate", "b": plain()}}, "exactly one integrator"),
+        ({"a": plain(), "b": plain()}, "at most one integrator"),
+        ({"a": {"type": "control_variate", "b": plain()}}, "at most one integrator"),
+        ({"a": {"type": "path"}, "max_depth": 3}, 'uses the parameter "max_depth"'),
         ({"a": learns}, 'set its "learn_every" to 0, or to 3 or more, found 2'),
         ({"a": plain(), "max_sensors": 0}, '"max_sensors" is 0'),
         ({"a": plain(), "spp": 4}, 'no parameter "spp"'),
@@ -270,6 +270,12 @@ def test_what_cannot_work_is_refused() -> None:
         with pytest.raises(RuntimeError) as error:
             mi.load_dict({"type": "control_variate", **parameters})
         assert re.search(message, one_line(error.value)), one_line(error.value)
+
+
+def test_by_default_samples_follow_lights_and_the_loss() -> None:
+    described = str(mi.load_dict({"type": "control_variate", "max_depth": 3}))
+    for words in ("composed_prb", "max_depth = 3", "contribution", "gradient_samples = loss"):
+        assert words in described, described
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering.pixel_sensitivity import PixelSensitivity
 from tests.support.stage import area, film, rectangle, rgb, sensor, stage
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -37,11 +38,12 @@ def integrator(name: str = "composed_prb", **parameters: Any) -> mi.Integrator:
 
 
 def gradients(
-    scene: mi.Scene, by: mi.Integrator, derivative: np.ndarray, seed: int, spp: int = 16
-) -> np.ndarray:
+    scene: mi.Scene, by: mi.Integrator, derivative: np.ndarray, seed: int, spp: int = 16,
+    ends: tuple[str, ...] = ENDS,
+) -> np.ndarray:  # fmt: skip
     """The sum over the channels of each parameter's gradient."""
     parameters = mi.traverse(scene)
-    keys = [next(k for k in parameters.keys() if k.endswith(end)) for end in ENDS]
+    keys = [next(k for k in parameters.keys() if k.endswith(end)) for end in ends]
     for key in keys:
         dr.enable_grad(parameters[key])
         dr.set_grad(parameters[key], 0)
@@ -92,6 +94,25 @@ def test_the_expected_gradient_does_not_change(of_film: dict[str, Any]) -> None:
     assert precision[0] < 0.03 and precision[2] < 0.05
     if not of_film:  # and more than half of the pixels have no effect
         assert np.mean(np.log(variances[0] / variances[1])) < np.log(0.8)
+
+
+def test_samples_follow_what_is_optimized() -> None:
+    """A ball that covers a tenth of the image gets half of the samples."""
+    scene, ends, seeds = room(), ("metal.bsdf.specular_reflectance.value",), range(12)
+    derivative = loss_of(scene, mask=False)
+    ours, evenly = (
+        np.array([gradients(scene, by, derivative, seed, 8, ends) for seed in seeds])
+        for by in (integrator(gradient_samples="loss"), integrator())
+    )
+    variances = [each.var(axis=0, ddof=1) for each in (ours, evenly)]
+    error = np.sqrt(sum(variances) / len(seeds))
+    assert (np.abs(ours.mean(axis=0) - evenly.mean(axis=0)) < 4 * error).all()
+    assert variances[0] < 0.5 * variances[1]
+
+
+def test_sensitivity_is_measured_less_and_less_often() -> None:
+    view = PixelSensitivity()
+    assert [n for n in range(1, 40) if view.is_due()] == [1, 2, 4, 8, 16, 32]
 
 
 def test_without_an_effect_the_gradient_is_zero() -> None:
