@@ -11,7 +11,8 @@ squared``, by the derivative of a squared error that was measured with 16 sample
 those with respect to all colours (except black ones), roughnesses and emissions of the scene that
 are no textures, and to the albedo and extinction of media;
 with ``--roughness``, with respect to roughnesses alone;
-with ``--lamps``, with respect to the emission of one of the lamps alone.
+with ``--lamps``, with respect to the emission of one of the lamps alone;
+with ``--singles``, with respect to one of the parameters alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
 over the renders but the first two, of the image and its gradients, of all cores; learning included.
 z: the difference of the means to those of ``prb``, in units of its standard error. In brackets: the
@@ -97,9 +98,10 @@ def load(
 )
 @click.option("--roughness", is_flag=True, help="Only of roughness.")
 @click.option("--lamps", default=0, help="Of so many lamps, each on its own, in scenes with more.")
+@click.option("--singles", default=0, help="Of so many parameters, each on its own.")
 def main(
     files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], loss: str,
-    roughness: bool, lamps: int,
+    roughness: bool, lamps: int, singles: int,
 ) -> None:  # fmt: skip
     """Compares on the scenes FILES."""
     mi.set_variant("llvm_ad_rgb")
@@ -112,9 +114,9 @@ def main(
             if key.endswith(ends) and np.any(np.array(parameters[key]) != 0)
         ]  # fmt: skip
         sets = [keys]
-        if lamps:
-            all_lamps = [[key] for key in keys if key.endswith("radiance.value")]
-            sets = all_lamps[:: -(-len(all_lamps) // lamps)]
+        if lamps or singles:
+            alone = [[key] for key in keys if singles or key.endswith("radiance.value")]
+            sets = alone[:: -(-len(alone) // (singles or lamps))]
         print(f"{file}, {spp} spp, {sum(map(len, sets))} parameters", flush=True)
         known = None
         unused = "prb" if has_media(scene) else "prbvolpath"

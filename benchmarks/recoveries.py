@@ -4,8 +4,8 @@
 
 Each task recovers parameters of a scene from one picture of it, by Adam: colours, lamps, a
 painting, roughness, an environment map, fog. All integrators take as many samples, have the same
-learning rates, and get the same processor time (of all cores; learning included, kernels from the cache on disk).
-In fog, ``prbvolpath`` stands for ``prb``.
+learning rates, and get the same processor time (of all cores; learning included, kernels from the
+cache on disk). In fog, ``prbvolpath`` stands for ``prb``.
 
 Error: the mean over the parameters, of their difference to the true ones (of their logarithms for
 lamps, roughness and fog), with the best of the learning rates. Speed: how much earlier the error
@@ -31,15 +31,11 @@ import numpy as np  # isort: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
-_COMPOSED = {"type": "composed_prb", "max_depth": 6, "next_event": "contribution"}
-
 #: What is compared with ``prb``.
 INTEGRATORS = {
-    "composed_prb": _COMPOSED,
-    "control_variate": {
-        "type": "control_variate", "nested": {**_COMPOSED, "gradient_samples": "loss"}
-    },
-}  # fmt: skip
+    "composed_prb": {"type": "composed_prb", "max_depth": 6, "next_event": "contribution"},
+    "control_variate": {"type": "control_variate", "max_depth": 6},
+}
 
 
 @dataclass

@@ -95,7 +95,7 @@ class ComposedPRB(common.RBIntegrator):
        - Number of renders of a scene after which the next one learns again, because materials and
          lights may have changed; 0 to learn only once. The number doubles each time, because what
          is learned stays good while parameters change little. The parameter is accepted only if a
-         decision learns. (Default: 32)
+         decision learns. (Default: 128)
      * - gradient_samples
        - |string|
        - Samples of the passes for gradients: :monosp:`even`, the same number in each pixel, or

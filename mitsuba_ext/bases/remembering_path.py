@@ -80,7 +80,7 @@ class RememberingPath(WalkIntegrator):
                 raise ValueError(f'"{self.name}" has no parameter "{key}": leave it out')
         self.learn_every = 0
         if self.can_learn:
-            self.learn_every = self.parameter(props, "learn_every", 32, minimum=0)
+            self.learn_every = self.parameter(props, "learn_every", 128, minimum=0)
         self._remembered: _Remembered | None = None
         self._renders, self._interval = 0, self.learn_every
         self._learned_from: SceneMark | None = None
@@ -162,7 +162,7 @@ class RememberingPath(WalkIntegrator):
         self._interval = 2 * self._interval if is_again else self.learn_every
         self._learned_from = SceneMark(request.scene)
         # Pilots are three quarters of the samples
-        samples = min(4 * self._pilot_spp // 3 + 1, spp * (self._interval or 32) // 4)
+        samples = min(4 * self._pilot_spp // 3 + 1, spp * (self._interval or 128) // 4)
         # Not the random numbers of the render that uses what is learned
         seed = int((mi.UInt32(request.seed) + 0x9E3779B9)[0])
         of_pilots = replace(

@@ -314,7 +314,7 @@ def composed_prb(
     pilot_spp: int = ...,
     save_learned: str = "",
     load_learned: str = "",
-    learn_every: int = 32,
+    learn_every: int = 128,
     gradient_samples: str = "even",
     max_depth: int = -1,
     rr_depth: int = 5,
@@ -341,10 +341,10 @@ def composed_prb(
             use what is learned. (Default: 32 with guided directions, otherwise 16)
         save_learned, load_learned (string): As in composed_path. (Default: none)
         learn_every (int): Number of renders of a scene after which the next one learns again,
-            because materials and lights may have changed; 0 to learn only once. (Default: 32)
+            because materials and lights may have changed; 0 to learn only once. (Default: 128)
         gradient_samples (string): Samples of the passes for gradients: even, the same number in
-            each pixel, or loss, more in pixels on whose values the loss depends most. (Default:
-            even)
+            each pixel, or loss, more in pixels where the derivative of the loss is large: the loss
+            depends on them, and they depend on what is optimized. (Default: even)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins, counted as in
             prb: one vertex later than in composed_path. (Default: 5)
@@ -358,6 +358,9 @@ def control_variate(
     *,
     max_sensors: int = 64,
     nested: Plugin = ...,
+    max_depth: int | bool = ...,
+    rr_depth: int | bool = ...,
+    hide_emitters: int | bool = ...,
     id: str = ...,
 ) -> dict[str, Any]:
     """Recursive control variates (control_variate).
@@ -369,8 +372,11 @@ def control_variate(
 
     Parameters:
         max_sensors (int): Most sensors whose last images are kept. (Default: 64)
-        (Nested plugin) (integrator): The integrator to render with, exactly one: composed_prb, prb,
-            prbvolpath, direct_projective, or another one that computes gradients.
+        (Nested plugin) (integrator): The integrator to render with, at most one: composed_prb, prb,
+            prbvolpath, direct_projective, or another one that computes gradients. (Default:
+            composed_prb with next_event = contribution and gradient_samples = loss)
+        max_depth, rr_depth, hide_emitters (int, int, bool): Parameters of the default integrator,
+            accepted only without a nested one. (Default: as in composed_prb)
     """
 
 
