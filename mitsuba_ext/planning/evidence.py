@@ -171,3 +171,9 @@ def expected_gain(efficiency: float, error: float) -> float:
     if efficiency <= 0:
         return -np.inf
     return _PRIOR**2 / (_PRIOR**2 + error**2) * float(np.log(efficiency))
+
+
+def expected_loss(error: float) -> float:
+    """By how much the logarithm of the expected time to an error exceeds −:func:`expected_gain`:
+    half the variance of what is not known of the logarithm."""
+    return 0.5 * _PRIOR**2 * error**2 / (_PRIOR**2 + error**2)

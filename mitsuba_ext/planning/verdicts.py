@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .evidence import expected_gain
+from .evidence import expected_gain, expected_loss
 from .prediction import Prediction
 
 #: Renders of fewer samples, which choose by themselves what to learn, learn nothing: the fixed cost
@@ -116,21 +116,19 @@ def beside_light_paths(efficiency: float) -> float:
 def best(
     efficiencies: np.ndarray, errors: Sequence[float], rival: float, guided: Sequence[float]
 ) -> tuple[int, int]:
-    """The candidate of the highest expected efficiency, and the best one except the first.
+    """The candidate of the least expected time to an error, and the best one except the first.
 
     Parameters:
-        efficiencies: Efficiency of each candidate; the first is ``path``. The prior is that it is
-            the efficiency of the second one.
-        errors: Standard errors of the logarithms of their ratios to the second one.
+        efficiencies: Efficiency of each candidate; the first is ``path``. The prior is that all
+            are as efficient as ``rival``.
+        errors: Standard errors of the logarithms of their ratios to the first one.
         rival: The efficiency of what was learned for ``path``, relative to ``path``.
         guided: For each candidate, the efficiency that guided directions add to it.
     """
-    efficiencies = efficiencies / efficiencies[1]
-    efficiencies[0] *= rival
-    gains = [expected_gain(*x) for x in zip(efficiencies, errors)]
+    relative = efficiencies / (efficiencies[0] * rival)
+    gains = [expected_gain(*x) - expected_loss(x[1]) for x in zip(relative, errors)]
     other = 1 + int(np.argmax(gains[1:]))
-    gains[other] += math.log(guided[other])
-    return (other if gains[other] > gains[0] else 0), other
+    return (other if gains[other] + math.log(guided[other]) > 0 else 0), other
 
 
 def is_beaten(
@@ -138,5 +136,6 @@ def is_beaten(
 ) -> bool:
     """Whether the first candidate is the best one beyond doubt. For parameters, see :func:`best`.
     """
-    doubt = math.exp(_BEYOND_DOUBT * max(errors[0], _LEAST_ERROR))
-    return best(efficiencies, errors, rival / doubt, guided)[0] == 0
+    other = best(efficiencies, errors, rival, guided)[1]
+    doubt = math.exp(_BEYOND_DOUBT * max(errors[other], _LEAST_ERROR))
+    return efficiencies[other] * guided[other] * doubt <= efficiencies[0] * rival

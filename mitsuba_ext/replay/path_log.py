@@ -189,6 +189,9 @@ class PathLog(Observer):
     def weighed(self, by_kind) -> None:
         pass
 
+    def found_by(self, light_path) -> None:
+        pass
+
     def traced(self, camera, whole) -> None:
         pass
 

@@ -216,6 +216,7 @@ class LightSubpaths(Subpaths):
                     self._sums, near_end, far_end, squared_distance,
                     (vertex.depth == 0, other.depth == 1), factor, chosen.expected,
                 )  # fmt: skip
+            self._techniques.found_by(other.lane)
             self._techniques.joined(
                 other.depth + 1, vertex.depth + 2, value, mis, competing, visible
             )

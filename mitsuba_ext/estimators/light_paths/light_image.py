@@ -157,6 +157,7 @@ class LightImage:
             value *= importance
         finite = active & dr.all(dr.isfinite(value))
         if self._observer is not None:
+            self._observer.found_by(vertex.lane)
             self._observer.splatted(
                 vertex.depth + 1, connection.position, value, mis, competing, finite
             )

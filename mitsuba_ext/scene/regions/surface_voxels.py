@@ -18,8 +18,9 @@ SIDES = 6
 #: The size of the table of rows, in bytes per voxel of the region.
 BYTES_PER_VOXEL = 4 * SIDES
 
-#: The maximum fraction of vertices outside the region, on either side of each axis.
-_MAX_OUTSIDE = 2e-3
+#: The maximum fraction of vertices outside the region, on either side of each axis; and about the
+#: most vertices that tell where the region ends.
+_MAX_OUTSIDE, _ENOUGH = 2e-3, 1 << 14
 
 #: The margin of the region on each side, in units of its size.
 _MARGIN = 0.02
@@ -94,7 +95,9 @@ def _side(n: mi.Normal3f) -> mi.UInt32:
 def region(p: mi.Point3f) -> mi.ScalarBoundingBox3f:
     """A box that holds nearly all points. A few distant ones are left out because they would make
     the voxels of the box coarse."""
-    count = dr.width(p)
+    stride = -(-dr.width(p) // _ENOUGH)
+    count = -(-dr.width(p) // stride)
+    p = dr.gather(mi.Point3f, p, dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, stride))
     in_order = dr.sort(mi.TensorXf(joined([p.x, p.y, p.z]), (3, count))).array
     place = np.array([_MAX_OUTSIDE, 1 - _MAX_OUTSIDE]) * (count - 1)
     below = place.astype(int)

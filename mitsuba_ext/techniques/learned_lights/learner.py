@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +21,6 @@ from ...planning.verdicts import (
     is_trial,
     prefers_tree,
 )
-from ...scene.lights.environment_bins import EnvironmentBins
 from ...scene.lights.light_cells import LightCells
 from ...scene.lights.weights import uniform_weights
 from ...scene.regions.surface_voxels import (
@@ -103,9 +103,8 @@ class LightMapLearner(Learner):
         self._is_tested = False
         self._tree: EmitterSampling | None = None
         self._tree_prediction: Prediction | None = None
-        # Makes a finer map than the first pilot had, with the same bins of the environment
+        # Makes a finer map than the first pilot had, with the same cells
         self._finer_map: Callable[[], LightMap] | None = None
-        self._bins: EnvironmentBins | None = None
 
     wants_scout = tells_visibility = True
 
@@ -117,16 +116,18 @@ class LightMapLearner(Learner):
         self._is_needed, self._records = True, None
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
-        self.map, self._records, self._bins = None, None, None
+        self.map = self._records = None
         self._summary = "lights: no path scatters"
-        if dr.width(p) > 0:
-            self.map = self._first_map(scene, p, n)
-            # Mitsuba samples these with a wrong density
-            self._is_needed |= self.map.cells.has_smooth_meshes
-            if self.map.cells.count == 1 and not self._is_needed:
-                self.map, self._summary = None, "lights: there is only one"
-        if self.map is None:
+        if dr.width(p) == 0:
             return None
+        bbox = region(p)
+        cells = LightCells(scene, voxel_edges(bbox, self.grid or _GRID))
+        # Mitsuba samples these with a wrong density
+        self._is_needed |= cells.has_smooth_meshes
+        if cells.count == 1 and not self._is_needed:
+            self._summary = "lights: there is only one"
+            return None
+        self.map = self._first_map(partial(self._new_map, scene, cells, bbox, p, n))
         self._scene = scene
         return self._begin_map()
 
@@ -143,24 +144,24 @@ class LightMapLearner(Learner):
             return TreeChoice(self._scene, self.map.cells, self.map.rows)
         return self._selection(self._probabilities(self.map.unoccluded))
 
-    def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
-        """The map of the first pilot."""
+    def _first_map(self, new_map: Callable[[float], LightMap]) -> LightMap:
+        """The map of the first pilot. ``new_map`` makes the finest one of at most this number of
+        entries."""
         limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
         trial = max(_FEW_ENTRIES, self.render_samples * _FIRST_ENTRIES)
         trial = math.inf if self._is_needed else trial
-        light_map = self._new_map(scene, p, n, min(limit, trial))
+        light_map = new_map(min(limit, trial))
         limit = min(limit, max(_FEW_ENTRIES, self.render_samples * _FINER_ENTRIES))
         if trial < limit and light_map.rows.resolution < _GRID:
-            self._finer_map = lambda: self._new_map(scene, p, n, limit)
+            self._finer_map = partial(new_map, limit)
         return light_map
 
-    def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f, limit: float) -> LightMap:
+    def _new_map(
+        self, scene: mi.Scene, cells: LightCells, bbox: mi.ScalarBoundingBox3f, p: mi.Point3f,
+        n: mi.Normal3f, limit: float,
+    ) -> LightMap:  # fmt: skip
         """The finest map of at most ``limit`` entries."""
-        bbox = region(p)
-        grid = self.grid or _GRID
-        cells = LightCells(scene, voxel_edges(bbox, grid), self._bins)
-        self._bins = cells.bins
-        counts = RowCounts(bbox, p, n)
+        counts, grid = RowCounts(bbox, p, n), self.grid or _GRID
 
         def fits(grid: int) -> bool:
             # A coarser grid has no more cells
@@ -248,7 +249,7 @@ class LightMapLearner(Learner):
         return self._selection(self._probabilities(self.map.weights(self.target)))
 
     def finish(self) -> None:
-        self.map = self._scene = self._finer_map = self._bins = None
+        self.map = self._scene = self._finer_map = None
 
     def _set_as_path(self, scene: mi.Scene) -> None:
         cells = self.map.cells

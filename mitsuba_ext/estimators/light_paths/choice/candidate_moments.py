@@ -11,6 +11,9 @@ from ..partial_sums import CompetingDensities
 from .candidates import Candidate
 from .rare_contributions import BINS, bin_of
 
+#: The number of groups of paths.
+GROUPS = 16
+
 
 class CandidateMoments:
     """For each pixel and each candidate, sums over the samples of a pass: of the second moment, and
@@ -32,13 +35,17 @@ class CandidateMoments:
     do: the photons of a camera path depend on each other. For each candidate that merges, the sum
     of what photons bring to a camera path shows this (:meth:`merged`).
 
+    In fog, a light path may bring light to many pixels, and a few paths most of a second moment.
+    Sums over groups of paths show this, where contrast between pixels does not
+    (:meth:`by_group`).
+
     Parameters:
         candidates: The candidates. The one without light paths has only the techniques of ``path``.
         pixels: Number of pixels.
         merging: c of merging, with which any technique adds the term of merging; ``None`` if
             merging adds its own term, in scenes with media.
         lanes: Number of camera paths, if merging adds its own term.
-        blocks: Number of blocks of pixels, for each of which there are sums by value.
+        blocks: Number of blocks of pixels, for each of which there are sums by value, and by group.
         block_of: The block of each pixel; ``None`` if each has its own.
     """
 
@@ -69,11 +76,13 @@ class CandidateMoments:
             self._merged = dr.zeros(mi.Float, 2 * sum(merges) * lanes)
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
         self._by_value = dr.zeros(mi.Float, 2 * self._count * blocks * BINS)
-        dr.eval(self._sums, self._by_value, self._merged)
+        self._by_group = dr.zeros(mi.Float, self._count * GROUPS * blocks)
+        dr.eval(self._sums, self._by_value, self._by_group, self._merged)
 
     @dr.syntax
     def add(
-        self, brought, mis, competing, pixel, active, count: float = 1.0, is_joined: bool = False,
+        self, brought, mis, competing, pixel, path, active, count: float = 1.0,
+        is_joined: bool = False,
         merging: mi.Float | None = None, lane: mi.UInt32 | None = None,
     ) -> None:  # fmt: skip
         """Adds a contribution.
@@ -82,6 +91,7 @@ class CandidateMoments:
             brought: The contribution, with its MIS weight ``mis``.
             competing: Densities of the techniques, including the one that found the contribution.
             pixel: The pixel of the contribution.
+            path: The number of the light path that brought it; of the camera path if there is none.
             count: The number of such contributions that MIS weights count as one sample.
             is_joined: Whether a connection of a camera path to a light path found it.
             merging, lane: c of merging, and the lane of the camera path, if merging found it and
@@ -107,6 +117,8 @@ class CandidateMoments:
             place = 2 * ((index * self._blocks + block) * mi.UInt32(BINS) + value_bin)
             add_to(self._by_value, brought, place, is_found)
             add_to(self._by_value, moment, place + 1, is_found)
+            place = (index * mi.UInt32(GROUPS) + path % GROUPS) * self._blocks + block
+            add_to(self._by_group, moment, place, is_found)
             if dr.hint(merging is not None, mode="scalar"):
                 part = brought / mis * own_share
                 merges = is_found & (factors.z > 0)
@@ -120,6 +132,10 @@ class CandidateMoments:
         contributions, [candidate, block, bin, 2]."""
         by_value = self._by_value.numpy().reshape(self._count, self._size, BINS, 2)
         return self._sums.numpy().reshape(self._count, -1, 2), by_value
+
+    def by_group(self) -> np.ndarray:
+        """The second moments that groups of paths have found, [candidate, group, block]."""
+        return self._by_group.numpy().reshape(self._count, GROUPS, self._size)
 
     def merged(self, lanes: int) -> np.ndarray:
         """For each candidate that merges: the sum, and the sum of the squares, of what photons

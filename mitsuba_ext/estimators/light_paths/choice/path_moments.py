@@ -18,7 +18,7 @@ from ....util.arrays import add_own, channel_mean, from_numpy, to_host
 from ..merging.merging import PHOTONS_PER_DISK
 from ..merging.merging_in_media import PHOTONS_PER_SAMPLE
 from ..partial_sums import CompetingDensities
-from .candidate_moments import CandidateMoments, add_to
+from .candidate_moments import GROUPS, CandidateMoments, add_to
 from .candidates import Available, Candidate, candidates
 from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
@@ -64,12 +64,15 @@ class Estimate:
             there are few samples.
         by_value: Light and second moment of one sample, by the value of contributions (see
             :func:`rare`), [candidate, block, bin, 2].
-        blocks: The film whose pixels are the blocks of ``by_value``.
+        by_group: The second moment of one sample, as groups of paths have found it, [candidate,
+            group, block].
+        blocks: The film whose pixels are the blocks of ``by_value`` and ``by_group``.
     """
 
     mean: np.ndarray
     variances: list[np.ndarray]
     by_value: np.ndarray
+    by_group: np.ndarray
     blocks: CoarseFilm
 
     def errors_of_render(
@@ -84,8 +87,7 @@ class Estimate:
             shares: Parts of the pixels that may hold rare contributions.
         """
         of_pixel, width = self.blocks.of_pixel, self.blocks.width
-        if of_pixel is not None:
-            scale = np.bincount(of_pixel) / np.bincount(of_pixel, 1 / scale)
+        scale = self._of_blocks(scale)
         errors: list[list[np.ndarray]] = [[] for _ in shares]
         missed: list[list[float]] = [[] for _ in shares]
         whole = max(self.mean.sum(), 1e-30)
@@ -96,6 +98,20 @@ class Estimate:
                 errors[i].append(error_of_render(variance, self.mean, lacks, spp))
                 missed[i].append(lacks.light.sum() / whole)
         return [(some, np.array(share)) for some, share in zip(errors, missed)]
+
+    def moments_of_groups(self, scale: np.ndarray) -> np.ndarray:
+        """The second moments that groups of paths have found in the whole image, relative to the
+        squared radiance of the pixels, [candidate, group]. ``scale``: see
+        :meth:`errors_of_render`."""
+        sizes = 1 if self.blocks.of_pixel is None else np.bincount(self.blocks.of_pixel)
+        return self.by_group @ (self._of_blocks(scale) ** 2 * sizes)
+
+    def _of_blocks(self, scale: np.ndarray) -> np.ndarray:
+        """1 / radiance of each block."""
+        of_pixel = self.blocks.of_pixel
+        if of_pixel is None:
+            return scale
+        return np.bincount(of_pixel) / np.bincount(of_pixel, 1 / scale)
 
     def never_found(self) -> np.ndarray:
         """For each candidate, the share of the light of paths that it cannot find."""
@@ -177,6 +193,7 @@ class PathMoments(TechniqueObserver):
         # The second moment and the light image of each candidate
         self._found = np.zeros((0, self._pixels, 2))
         self._by_value = np.zeros((0, self._block_count, BINS, 2))
+        self._by_group = np.zeros((0, GROUPS, self._block_count))
         # In scenes with media, for each candidate that merges: what photons bring to camera paths,
         # and products of the photons of a camera path, [candidate, 2, pixel]
         self._photons: np.ndarray | None = None
@@ -184,8 +201,8 @@ class PathMoments(TechniqueObserver):
     # ---- Observer ----
 
     def kernel_state(self) -> tuple:
-        """The attributes on which kernels depend (``frozen.py``). What ``weighed`` remembers is
-        part of the kernel itself."""
+        """The attributes on which kernels depend (``frozen.py``). What ``weighed`` and
+        ``found_by`` remember is part of the kernel itself."""
         return (
             self._pixel, self._importance, self._lane, self._path, self._squares, self._merged,
             self._joined, self._shadow_count, self._looked, self._splats, self._moments,
@@ -198,6 +215,7 @@ class PathMoments(TechniqueObserver):
             count = len(self.candidates)
             self._found = np.zeros((count, self._pixels, 2), np.float32)
             self._by_value = np.zeros((count, self._block_count, BINS, 2), np.float32)
+            self._by_group = np.zeros((count, GROUPS, self._block_count), np.float32)
             self._shared = available.samples_per_vertex(self._spp, self._film_pixels)
         # MIS weights count these vertices as one sample, but the samples of a pixel share vertices
         merging = [x / y for x, y in zip(self._shared, _PER_SAMPLE)]
@@ -222,10 +240,13 @@ class PathMoments(TechniqueObserver):
             self._path, self._squares, self._merged, self._joined, self._shadow_count,
             self._looked, self._splats, self._importance,
         )  # fmt: skip
-        self._by_kind = mi.Vector2f(0)
+        self._by_kind, self._light_path = mi.Vector2f(0), self._lane
 
     def weighed(self, by_kind: mi.Vector2f) -> None:
         self._by_kind = by_kind
+
+    def found_by(self, light_path: mi.UInt32) -> None:
+        self._light_path = light_path
 
     def searched(self, count: mi.UInt32) -> None:
         add_own(self._looked, count, self._lane)
@@ -256,7 +277,7 @@ class PathMoments(TechniqueObserver):
         add_own(self._path, part, self._lane, active)
         add_own(self._squares, dr.square(part), self._lane, active)
         competing = CompetingDensities(mi.Vector2f(1, other), self._by_kind)
-        self._moments.add(brought, mis, competing, self._pixel, active)
+        self._moments.add(brought, mis, competing, self._pixel, self._lane, active)
 
     def joined(self, s, t, value, mis, competing, active) -> None:
         own = CompetingDensities(competing.by_camera, competing.by_kind + mi.Vector2f(1, 0))
@@ -281,8 +302,9 @@ class PathMoments(TechniqueObserver):
         brought = self._brightness(value)
         active = active & (brought > 0)
         self._moments.add(
-            brought, mis, competing, self._pixel, active, count, is_joined, merging, self._lane
-        )
+            brought, mis, competing, self._pixel, self._light_path, active, count, is_joined,
+            merging, self._lane,
+        )  # fmt: skip
 
     def splatted(self, s, position, value, mis, competing, active) -> None:
         brought = channel_mean(value)
@@ -292,7 +314,7 @@ class PathMoments(TechniqueObserver):
         add_to(self._splats, brought, 2 * pixel, active)
         add_to(self._splats, dr.square(brought), 2 * pixel + 1, active)
         own = CompetingDensities(competing.by_camera, competing.by_kind + mi.Vector2f(0, 1))
-        self._moments.add(brought, mis, own, pixel, active)
+        self._moments.add(brought, mis, own, pixel, self._light_path, active)
 
     def _place(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.UInt32:
         """The place of a pixel in the arrays."""
@@ -335,6 +357,7 @@ class PathMoments(TechniqueObserver):
         found, by_value = self._moments.taken()
         self._found += found
         self._by_value += by_value
+        self._by_group += self._moments.by_group()
         lanes = len(pixel)
         self.samples += lanes
         tested, looked, scattered, all_tested, all_scattered = (
@@ -376,8 +399,10 @@ class PathMoments(TechniqueObserver):
         ]
         variances[0] = (moments[0] + own_products) / n - squared_mean
         block = np.arange(self._pixels) if self._block_of is None else self._blocks.of_pixel
-        self._by_value /= np.bincount(block, n).astype(np.float32)[:, None, None]
-        return Estimate(mean, variances, self._by_value, self._blocks)
+        samples = np.bincount(block, n).astype(np.float32)
+        self._by_value /= samples[:, None, None]
+        self._by_group /= samples
+        return Estimate(mean, variances, self._by_value, self._by_group, self._blocks)
 
     def _excess_of_photons(self, n: np.ndarray) -> list[np.ndarray | float]:
         """For each candidate: by how much products of what photons bring to a camera path exceed

@@ -73,6 +73,10 @@ class TechniqueObserver(Observer):
         """A technique of camera paths alone has been weighed; its contribution is reported next
         (``emission``, ``connection``). See :class:`CompetingDensities` for ``by_kind``."""
 
+    def found_by(self, light_path: mi.UInt32) -> None:
+        """The number of the light path to which the contribution belongs that is reported next
+        (``joined``, ``splatted``, ``merged``)."""
+
     def traced(self, camera: Sample, whole: Sample) -> None:
         """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
         light paths included; ``whole`` holds the samples of all techniques."""

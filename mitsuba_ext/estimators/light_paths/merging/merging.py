@@ -316,5 +316,6 @@ class MergedSubpaths(Subpaths):
             if self._sums is None:
                 self._observer.photon(brought, active)
             else:
+                self._observer.found_by(other.lane)
                 self._observer.merged(brought, mis, competing, active)
         return dr.select(active, value, 0)

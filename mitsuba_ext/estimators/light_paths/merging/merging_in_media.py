@@ -212,6 +212,7 @@ class MergedInMedia(MergedSubpaths):
             if sums.splits:
                 is_first = other.depth == 1, vertex.depth == 0
                 competing = sums.competing_with_merging(*ends, is_first)
+            self._observer.found_by(other.lane)
             self._observer.merged(brought, mis, competing, active, in_medium=True)
         return dr.select(active, value, 0)
 
