@@ -55,6 +55,25 @@ def trimmed_batches(error: np.ndarray, more: np.ndarray) -> np.ndarray:
     ).astype(np.float64)
 
 
+def brightest_kept(square: mi.Float) -> mi.Float:
+    """The brightness of the brightest path that is not left out, from the brightness of all paths;
+    infinity if there are too few of them to leave one out."""
+    left_out = -(-len(square) // TRIM)
+    if len(square) <= left_out:
+        return dr.opaque(mi.Float, dr.inf)
+    # The groups of paths show where to look: few values are copied to the host
+    length = -(-len(square) // _GROUPS)
+    groups = dr.block_reduce(dr.ReduceOp.Max, square, length, mode="evaluated")
+    bright = dr.compress(square >= _largest(groups, left_out + 1))
+    return _largest(dr.gather(mi.Float, square, bright), left_out + 1)
+
+
+def _largest(values: mi.Float, number: int) -> mi.Float:
+    """The largest value but ``number`` − 1; the smallest if there are fewer."""
+    place = max(len(values) - number, 0)
+    return dr.opaque(mi.Float, float(np.partition(values.numpy(), place)[place]))
+
+
 class PathSums:
     """The sums of :func:`trimmed_batches` on the device, over all passes of a stage, and sums of
     other quantities. All of them are copied to the host at once.

@@ -134,27 +134,30 @@ def _cells_of(code, value, weight, tree, more: int) -> Cells:
     """The cells that have samples, with room for the sums of ``more`` cells."""
     # In double precision, so that the order of the samples does not matter. Opaque: other
     # counts share the kernel
-    count = dr.opaque(mi.Float64, len(value))
-    scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / count, 1e-30))
+    count = dr.opaque(mi.UInt32, len(value))
+    scale = dr.rcp(dr.maximum(dr.sum(mi.Float64(value)) / mi.Float64(count), 1e-30))
     key = (tree << DEPTH) | code
-    trees = int(dr.max(tree)[0]) + 1
-    # Those that have samples are numbered in the order of their keys
-    number = dr.zeros(mi.UInt32, trees << DEPTH)
-    dr.scatter(number, mi.UInt32(1), key)
-    keys = dr.compress(number > 0)
-    dr.scatter(number, dr.arange(mi.UInt32, len(keys)), keys)
+    order = dr.argsort(key)
+    key = dr.gather(mi.UInt32, key, order)
     # The largest of n values is at most n times their mean
-    value, weight = dr.minimum(mi.Float64(value) * scale, _LIMIT), mi.Float64(weight)
-    cell, size = 3 * dr.gather(mi.UInt32, number, key), len(keys) + more
-    # Side by side, which saves two of three accesses to memory
-    sums = dr.zeros(mi.UInt64, 3 * size)
-    for index, (x, unit) in enumerate(zip((value, dr.square(value), weight), UNITS)):
-        dr.scatter_add(sums, mi.UInt64(x * unit), cell + index, mode=dr.ReduceMode.Direct)
-    place = 3 * dr.arange(mi.UInt32, size)
-    columns = [dr.gather(mi.UInt64, sums, place + index) for index in range(3)]
+    value = dr.minimum(mi.Float64(dr.gather(mi.Float, value, order)) * scale, _LIMIT)
+    weight = mi.Float64(dr.gather(mi.Float, weight, order))
+    fixed = [mi.UInt64(x * y) for x, y in zip((value, dr.square(value), weight), UNITS)]
+    # The last sample of each cell
+    index = dr.arange(mi.UInt32, len(key))
+    following = dr.gather(mi.UInt32, key, index + 1, index + 1 < count)
+    is_last = (index + 1 == count) | (key != following)
     # Evaluated together: each of them alone would be a kernel of its own
-    dr.eval(columns)
-    return Cells(keys, *(dr.cumsum(x) for x in columns))
+    dr.eval(key, fixed, is_last)
+    running = [dr.cumsum(x) for x in fixed]
+    last = dr.compress(is_last)
+    size, cell = len(last) + more, dr.arange(mi.UInt32, len(last))
+    sums = [dr.empty(mi.UInt64, size) for _ in range(3)]
+    for target, x in zip(sums, running):
+        put(target, dr.gather(mi.UInt64, x, last), cell)
+    cells = Cells(dr.gather(mi.UInt32, key, last), *sums)
+    dr.eval(cells)
+    return cells
 
 
 def cell_code(u: mi.Point2f) -> mi.UInt32:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...planning.evidence import BATCHES, TRIM
+from ...planning.evidence import BATCHES, brightest_kept
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...util.arrays import joined
@@ -189,14 +189,16 @@ class PathRecords(Observer):
         square = dr.minimum(dr.square(value) * importance, 1e30)
         # The contribution after the first vertex stands for the whole path
         first = dr.compress(dr.gather(mi.UInt32, self.bounce, new) == 0)
-        of_paths = dr.gather(mi.Float, square, first).numpy()
-        left_out = -(-self.paths // TRIM)
-        if len(of_paths) <= left_out:
+        of_paths = dr.gather(mi.Float, square, first)
+        most = brightest_kept(of_paths)
+        bright = dr.compress(of_paths > most)
+        if len(bright) == 0:
             return square, self.variances
-        most = np.partition(of_paths, -left_out - 1)[-left_out - 1]
-        batch = dr.gather(mi.UInt32, self.batch, dr.gather(mi.UInt32, new, first)).numpy()
-        excess = np.bincount(batch, np.maximum(of_paths - most, 0), BATCHES)
-        return dr.minimum(square, dr.opaque(mi.Float, float(most))), self.variances - excess
+        excess = dr.gather(mi.Float, of_paths, bright) - most
+        record = dr.gather(mi.UInt32, new, dr.gather(mi.UInt32, first, bright))
+        batch = dr.gather(mi.UInt32, self.batch, record)
+        excess = np.bincount(batch.numpy(), excess.numpy(), BATCHES)
+        return dr.minimum(square, most), self.variances - excess
 
     def chosen(self, chosen: mi.Bool) -> Samples:
         """Some of the samples, after :meth:`finish`."""

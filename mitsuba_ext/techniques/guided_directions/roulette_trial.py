@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ...planning.evidence import TRIM
+from ...planning.evidence import brightest_kept
 from ...planning.pixel_estimates import PixelEstimates, brightness
 from ...transport.observer import Observer
 from ...transport.path_decisions import LARGEST_PROBABILITY, unguided_throughput
@@ -125,7 +124,9 @@ class RouletteTrial(Observer):
         ]
         squares = [error + more * weight for more, _ in found]
         dr.eval(squares, found)
-        is_kept = _without_brightest(functools.reduce(dr.maximum, squares))
+        # The largest square that a path has with any way to draw it
+        largest = functools.reduce(dr.maximum, squares)
+        is_kept = largest <= brightest_kept(largest)
         columns = [dr.select(is_kept, mi.Float64(x), 0) for x in squares]
         columns += [mi.Float64(segments) for _, segments in found]
         # Evaluated together: each of them alone would be a kernel of its own
@@ -166,13 +167,3 @@ class RouletteTrial(Observer):
             throughput = dr.select(goes_on, throughput * ratio, throughput)
         # Ignore squares of large numbers that overflow
         return dr.select(dr.isfinite(more), more, 0), segments
-
-
-def _without_brightest(square: mi.Float) -> mi.Bool:
-    """The paths of a pass without the brightest ones. ``square`` is the largest square that a path
-    has with any way to draw it."""
-    left_out = -(-len(square) // TRIM)
-    if len(square) <= left_out:
-        return mi.Bool(True)
-    most = np.partition(square.numpy(), -left_out - 1)[-left_out - 1]
-    return square <= dr.opaque(mi.Float, float(most))

@@ -132,8 +132,8 @@ def test_photons_of_a_camera_path_count_together() -> None:
     lane, competing = mi.UInt32(0, 1), CompetingDensities(mi.Vector2f(0), mi.Vector2f(3, 0))
     for brought in (1, 2):
         moments.add(
-            mi.Float(brought, 0), mi.Float(1 / 4), competing, mi.UInt32(0, 0), mi.Bool(True),
-            merging=mi.Float(1), lane=lane,
+            mi.Float(brought, 0), mi.Float(1 / 4), competing, mi.UInt32(0, 0), lane,
+            mi.Bool(True), merging=mi.Float(1), lane=lane,
         )  # fmt: skip
     found = moments.merged(2)
     np.testing.assert_allclose(found[:, 0], [[3, 5], [12, 80]])

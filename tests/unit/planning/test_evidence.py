@@ -14,7 +14,7 @@ from mitsuba_ext.planning.evidence import (
     gain_of,
     trimmed_batches,
 )
-from mitsuba_ext.planning.verdicts import is_worth
+from mitsuba_ext.planning.verdicts import best, is_worth
 
 
 def _paths(seed: int, count: int = 1 << 14) -> tuple[np.ndarray, np.ndarray]:
@@ -84,3 +84,12 @@ def test_few_of_many_equal_paths_are_left_out() -> None:
     sums, ones = PathSums(0), dr.full(mi.Float, 1, 4 * TRIM)
     sums.add(ones, ones)
     assert sums.read()[0].sum(axis=1) == pytest.approx(4 * TRIM - 4)
+
+
+@pytest.mark.parametrize(("error", "chosen"), [(0.1, 2), (1.0, 1), (3.0, 0)])
+def test_light_paths_must_gain_more_where_the_prediction_is_uncertain(
+    error: float, chosen: int
+) -> None:
+    """Merging seems to be twice as efficient as ``path``; light paths are better by a fifth."""
+    efficiencies, errors = np.array([1.0, 1.2, 2.0]), [0.0, error / 4, error]
+    assert best(efficiencies, errors, 1.0, [1.0, 1.0, 1.0])[0] == chosen

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mitsuba_ext.estimators.light_paths.choice.candidate_moments import GROUPS
 from mitsuba_ext.estimators.light_paths.choice.path_moments import Estimate
 from mitsuba_ext.estimators.light_paths.choice.predicted_errors import PredictedErrors
 from mitsuba_ext.estimators.light_paths.choice.rare_contributions import BINS, error_of_render, rare
@@ -94,7 +95,8 @@ def _estimate(never_found: float) -> Estimate:
     mean = np.full(PIXELS, 1 + never_found)
     variances = [np.full(PIXELS, variance) for variance in (0.5, 1.0)]
     film = CoarseFilm.whole(WIDTH, PIXELS // WIDTH)
-    return Estimate(mean, variances, np.stack([path, everything]), film)
+    by_group = np.full((2, GROUPS, PIXELS), 1 / GROUPS)
+    return Estimate(mean, variances, np.stack([path, everything]), by_group, film)
 
 
 def test_missing_light_outweighs_noise_in_long_renders_only() -> None:
@@ -110,3 +112,13 @@ def test_missing_light_outweighs_noise_in_long_renders_only() -> None:
 def test_a_millionth_of_the_light_is_not_missing() -> None:
     predicted = PredictedErrors.of(_estimate(1e-8), WIDTH, 1 << 14, PIXELS)
     np.testing.assert_allclose(predicted.long_run, [1, 2], rtol=1e-3)
+
+
+def test_one_light_path_in_many_pixels_makes_a_prediction_uncertain() -> None:
+    """It brings ``path`` half of its second moment in all pixels, which therefore agree."""
+    estimate = _estimate(0.0)
+    alike = PredictedErrors.of(estimate, WIDTH, 16, PIXELS)
+    estimate.by_group[0, 0] += 1
+    by_one = PredictedErrors.of(estimate, WIDTH, 16, PIXELS)
+    assert alike.uncertainty[1] < 0.01 and by_one.uncertainty[1] > 0.5
+    assert alike.uncertainty[0] == by_one.uncertainty[0] == 0
