@@ -16,7 +16,7 @@ from ...planning.pixel_estimates import PixelEstimates
 from ...planning.prediction import Effect, Prediction
 from ...scene.regions.nested_regions import NestedRegions
 from ...transport.observer import Observer
-from ...util.arrays import from_numpy
+from ...util.arrays import from_numpy, to_host
 from ...util.stored_arrays import StoredArrays
 from .decisions import FocalScattering
 from .fitting import LineArrays, fitted_boxes, fitted_rows
@@ -292,9 +292,10 @@ def _chosen(lines: Lines, bsdf: mi.Float, value: np.ndarray, most: int) -> LineA
     index = np.searchsorted(running, (np.arange(count) + 0.5) / count)
     index, times = np.unique(np.minimum(index, len(value) - 1), return_counts=True)
     where = from_numpy(mi.UInt32, index)
-    p, d = (dr.gather(type(x), x, where).numpy().T for x in (lines.p, lines.d))
-    region = dr.gather(mi.UInt32, lines.region, where).numpy()
-    density = dr.gather(mi.Float, bsdf, where).numpy()
+    columns = (*lines.p, *lines.d, lines.region, bsdf)
+    # All at once: vectors alone would compile a kernel for each number of lines
+    *found, region, density = to_host(*(dr.gather(type(x), x, where) for x in columns))
+    p, d = np.stack(found[:3], axis=1), np.stack(found[3:], axis=1)
     return LineArrays(p, d, region, density, times.astype(np.float32))
 
 
