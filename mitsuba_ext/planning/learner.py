@@ -44,10 +44,6 @@ class Learner(Observer):
     #: Whether it learns which lights a vertex sees (:meth:`shadow_test`).
     tells_visibility = False
 
-    #: Whether the last pilot has shown that the next stages have far less variance than the pilots
-    #: until now, so that these are left out of the image.
-    discards_pilots = False
-
     #: Whether another learner may take the place of this one, where it is more efficient.
     can_be_replaced = False
 

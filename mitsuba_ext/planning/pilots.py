@@ -23,7 +23,7 @@ _ENOUGH_PATHS, _FEW_SAMPLES = 1 << 18, 4
 #: learning.
 _TRIAL_PATHS = 1 << 17
 
-#: The largest relative rise of variance, by unequal weights of samples, where no map helps.
+#: The largest relative rise of variance, by unequal weights of samples, where learning is no help.
 _MOST_LOSS = 0.015
 
 #: Where maps help, a sample that is drawn from a map of n samples per pixel is worth about
@@ -103,9 +103,13 @@ def first_parts(pixel_count: int, spp: int) -> int:
 
 
 def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
-    """For each stage, the weight of its samples relative to the last stage. Where maps
-    help much, equal weights would leave most of the noise to samples of the first stages. Where
-    maps do not help, unequal weights raise the variance by 1.5 % at most, which limits them.
+    """For each stage, the weight of its samples relative to the last stage, where each pilot
+    doubles the samples (``Technique.doubles``).
+
+    Weights must not depend on any sample: if bright pilots were more likely to be left out, the
+    image would be too dark. Where learning helps much, equal weights would leave most of the noise
+    to samples of the first stages. Where it does not help, unequal weights raise the variance by
+    1.5 % at most, which limits them.
 
     Parameters:
         stages: Samples per pixel of each stage.
@@ -116,7 +120,25 @@ def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
     shares = [0.5 ** (parts - max(part, 1)) for part in range(parts)] if parts > 1 else [1.0]
     known = np.cumsum([0.0, *(stages[0] * share for share in shares), *stages[1:]])[:count]
     wanted = (known + _UNIFORM) / (known + _HALF)
-    wanted = list(wanted / wanted[-1])
+    return _weights(stages, shares, wanted / wanted[-1])
+
+
+def weights_by_share(stages: Sequence[int]) -> list[float]:
+    """The same where pilots do not double. A sample is thought to be worth as much as the share of
+    all pilots that its stage has learned from."""
+    known = np.cumsum([0.0, *stages[:-1]])
+    return _weights(stages, [1.0], known / known[-1]) if known[-1] else [1.0] * len(stages)
+
+
+def _weights(
+    stages: Sequence[int], shares: Sequence[float], wanted: np.ndarray
+) -> list[float]:
+    """The weights nearest to ``wanted`` that raise the variance by no more than ``_MOST_LOSS``.
+
+    Parameters:
+        shares: The share of the pixels in each part of the first stage.
+    """
+    wanted, parts = wanted.tolist(), len(shares)
 
     def weights(share: float) -> list[float]:
         return [1 - share * (1 - weight) for weight in wanted]

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..rendering.device import SampleBytes, device_of
+from ..rendering.plan import is_independent
 from ..rendering.stages import Learning, Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..transport.decisions import Decisions
@@ -22,7 +23,7 @@ from ..util.stored_arrays import StoredArrays
 from . import verdicts
 from .costs import LIGHT_PATH_KERNELS
 from .learner import Learner, Pilot
-from .pilots import first_parts, stage_weights
+from .pilots import first_parts, stage_weights, weights_by_share
 from .technique import Setting, Technique
 from .trial import Rival, Trial
 
@@ -110,7 +111,12 @@ class Planner(Schedule):
         recorded = max((t.bytes_per_sample for t in learning_ones), default=0)
         self._most_lanes = device_of(mi.Float).lanes(SampleBytes(recorded)) if recorded else 0
         #: For each stage, the weight of its samples relative to the last stage
-        self._weights = stage_weights(stages) if self._doubles else [1.0] * len(stages)
+        self._weights = [1.0] * len(stages)
+        if self._doubles:
+            self._weights = stage_weights(stages)
+        elif is_independent(setting.sensor) and any(t.tries for t in learning_ones):
+            # Unequal weights would spoil the strata of other samplers
+            self._weights = weights_by_share(stages)
         self._learning, self._savers = learning, savers
         self._states: dict[str, dict[str, np.ndarray]] = {}
         self._scout: Scout | None = None
@@ -221,13 +227,8 @@ class Planner(Schedule):
             camera=self.decisions.camera,
             weight=self._weights[self._finished_stages],
             most_lanes=self._most_lanes,
-            discards_earlier=self._discards_pilots,
             observer=observer,
         )
-
-    @property
-    def _discards_pilots(self) -> bool:
-        return any(learner.discards_pilots for learner in self.learners.values())
 
     # ---- The trial ----
 
@@ -254,7 +255,8 @@ class Planner(Schedule):
         stage, self._next = self._next, None
         choice = trial.choose(self._rival)
         if choice is None:
-            return self._checked_stage(stage)
+            stage = self._checked_stage(stage)
+            return replace(stage, discards_earlier=trial.discards_pilots)
         self._take_up_again = self._leave_out()
         if trial.path_variance is not None:
             for learner in self.learners.values():
@@ -269,7 +271,7 @@ class Planner(Schedule):
                 self.decide(**{slot: self.learners[slot].start_again()})
         self.decide(light_paths=choice)
         stage = self._checked_stage(self._stage())
-        return replace(stage, discards_earlier=trial.chosen_variance < verdicts.FAR_LESS)
+        return replace(stage, discards_earlier=trial.discards_pilots)
 
     def _checked_stage(self, stage: Stage) -> Stage:
         """A stage after the trial, whose variance is measured; or, if it is the last one, the stage
@@ -280,7 +282,7 @@ class Planner(Schedule):
         if trial.reconsider(self._rival) is not None:
             self.decide(light_paths=None)
             self._take_up_again()
-        return replace(self._stage(), discards_earlier=self._discards_pilots)
+        return self._stage()
 
     def _finds_all_light(self, slot: str) -> bool:
         return self._techniques[slot].finds_all_light
@@ -343,6 +345,5 @@ class Planner(Schedule):
         effects = {slot: learner.effect for slot, learner in everyone.items()}
         effects = {slot: effect.as_dict() for slot, effect in effects.items() if effect}
         return Stage(
-            estimator, learned, effects, camera=self.decisions.camera, most_lanes=most,
-            discards_earlier=self._discards_pilots,
-        )  # fmt: skip
+            estimator, learned, effects, camera=self.decisions.camera, most_lanes=most
+        )

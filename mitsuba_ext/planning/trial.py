@@ -34,7 +34,9 @@ class Trial(Learner):
         samples: A pixel for each sample of the stage.
         can_be_guided: Whether camera paths are guided beside what was chosen.
         check: Checks what was chosen; ``None`` if there is nothing to check.
-        chosen_variance: The variance of what was chosen, relative to the samples before.
+        discards_pilots: Whether the pilots before the trial are left out of the image, because what
+            was tried has far less variance. It does not depend on these pilots: if bright ones were
+            more likely to be left out, the image would be too dark.
         chosen_time: The time of a sample of what was chosen, relative to ``path``.
         path_variance: The variance of a sample of ``path``, relative to the squared radiance of its
             pixel, and the same without the brightest contributions; ``None`` if it is not known.
@@ -43,7 +45,7 @@ class Trial(Learner):
     samples: np.ndarray
     can_be_guided: bool
     check: PredictionCheck | None
-    chosen_variance: float
+    discards_pilots: bool
     chosen_time: float
     path_variance: tuple[float, float] | None = None
 

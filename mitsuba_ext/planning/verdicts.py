@@ -57,8 +57,7 @@ _BEYOND_DOUBT, _LEAST_ERROR = 2.0, 0.05
 #: 0.15 in door_ajar in fog, measured 0.38; 0.02 in tissue, measured 0.06).
 PHOTONS_ALONE = 4.0
 
-#: Pilots are left out of the image if later stages have less than this part of their variance: at
-#: equal weights, a quarter of all samples then adds more noise than it removes.
+#: What was learned has far less variance if it has less than this part of the variance before.
 FAR_LESS = 0.4
 
 #: The efficiency of guides that are learned from all pilots, relative to that which short ones

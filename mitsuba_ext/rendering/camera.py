@@ -324,15 +324,21 @@ def check_takes_splats(film: mi.Film) -> None:
         )
 
 
-def put_splats(film: mi.Film, block: mi.ImageBlock, splats: Splats) -> None:
-    """Puts splats into a block of their own, without weights (``filter_weights.py``)."""
+def put_splats(
+    film: mi.Film, block: mi.ImageBlock, splats: Splats, count: mi.Float | float = 1.0
+) -> None:
+    """Puts splats into a block of their own, without filter weights (``filter_weights.py``).
+
+    Parameters:
+        count: The weight of their samples.
+    """
     check_takes_splats(film)
     values = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
     values.append(mi.Float(0))
     for part in splats.channels:
         values += film_colours(part, splats.wavelengths)
     values += [mi.Float(0)] * (block.channel_count() - len(values))
-    block.put(splats.position, values, splats.active)
+    block.put(splats.position, [value * count for value in values], splats.active)
 
 
 def _channels(

@@ -12,8 +12,9 @@ from ..util.arrays import from_numpy
 _TABLE = 1 << 12
 
 
-def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp: int) -> None:
-    """Adds splats to a film that holds ``spp`` camera samples per pixel, and no splats yet.
+def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp: float) -> None:
+    """Adds splats to a film that holds ``spp`` camera samples per pixel, by weight, and no splats
+    yet.
 
     The film divides each pixel by the sum of the filter weights of its camera samples. This sum is
     random, and its inverse is too large on average: by 6 % for one sample and a gaussian filter.

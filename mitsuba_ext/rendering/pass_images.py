@@ -38,8 +38,10 @@ class PassImages:
         if not self._is_special:
             self._before, self._spp_before = self._sums(block, splats), spp
 
-    def add(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
-        """Called after each pass, as :meth:`begin`."""
+    def add(
+        self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int, count: float
+    ) -> None:
+        """Called after each pass, as :meth:`begin`. ``count`` is the weight of its samples."""
         if self._is_special:
             return
         now = self._sums(block, splats)
@@ -48,7 +50,7 @@ class PassImages:
         image = colour / dr.select(weight == 0, 1, weight)
         if self._weights is None:
             self._weights = expected_weights(self._film)
-        image += splatted / (dr.opaque(mi.Float64, own) * self._weights)
+        image += splatted / (dr.opaque(mi.Float64, own * count) * self._weights)
         image = dr.select(dr.isfinite(image), image, 0)
         # Welford's update, weighted by the samples of the pass
         self.count, self._spp = self.count + 1, self._spp + own

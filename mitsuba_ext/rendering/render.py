@@ -1,9 +1,9 @@
 """The ``render()`` that all our integrators share: stages, passes, time budget, film, statistics.
 
 A render is a sequence of *stages*. All but the last are pilots: their samples teach the integrator
-something *and* land in the film, with weights that are fixed before the first sample is taken (each
-sample counts the same). A stage is cut into *passes* of bounded size, so that peak memory does not
-depend on the number of samples, and all passes of a stage run the same kernel.
+something *and* land in the film, with weights that are fixed before the first sample is taken. A
+stage is cut into *passes* of bounded size, so that peak memory does not depend on the number of
+samples, and all passes of a stage run the same kernel.
 """
 
 from __future__ import annotations
@@ -38,6 +38,9 @@ from .staged import Staged
 from .stages import Schedule, Stage
 from .statistics import PassTimer, RenderStatistics
 from .turns import let_others, tell
+
+#: Stands for a trial in the place of the number of a pass, which is smaller.
+_TRIAL = 0xFFFFFFFF
 
 
 def render(integrator: Staged, request: Request, job: type[Job] | None = None) -> mi.TensorXf:
@@ -140,8 +143,8 @@ class Job:
         self.block, self.splats = self.film.create_block(), None
         # One kernel for all passes: coalescing is decided once
         self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
-        # Samples per pixel that are not part of the image
-        self.forgotten = 0
+        # Samples per pixel that are not part of the image, and the sum of the weights of the others
+        self.forgotten, self.weight = 0, 0.0
 
     def _lanes(self, spp: int, pixels: range | np.ndarray | None = None) -> int:
         return (self.plan.pixel_count if pixels is None else len(pixels)) * spp
@@ -210,7 +213,7 @@ class Job:
             timer = PassTimer()
             if discards:
                 # Not before there are others
-                discards, self.forgotten = False, before
+                discards, self.forgotten, self.weight = False, before, 0.0
                 self.block.clear()
                 self.splats = None
                 if self.masks is not None:
@@ -220,7 +223,7 @@ class Job:
             compiled = self.run_pass(stage, spp)
             done += spp
             if stage.images is not None:
-                stage.images.add(self.block, self.splats, before + done)
+                stage.images.add(self.block, self.splats, before + done, stage.weight)
             if not compiled:
                 known.passed(spp, done, timer.seconds)
             self._show()
@@ -257,6 +260,7 @@ class Job:
             dr.sync_thread()
             self.statistics.passes += 1
             self.statistics.rays["camera"] += len(pixels)
+            self.weight += stage.weight * len(pixels) / self.plan.pixel_count
         self.statistics.spp += 1
 
     def _stopped(self, interrupt: threading.Event) -> bool:
@@ -273,10 +277,13 @@ class Job:
 
     def _scout(self, stage: Stage, pixels: range | np.ndarray | None) -> None:
         sampler = mi.load_dict({"type": "independent"})
-        # The same numbers for all seeds: the decisions of a scout change sizes of tables, and with
-        # them the kernels
-        number = 0 if stage.pixels is not None or pixels is None else pixels.start
-        sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
+        if stage.pixels is not None:
+            self._seed(sampler, _TRIAL, 1, pixels)
+        else:
+            # The same numbers for all seeds: the decisions of a scout change sizes of tables, and
+            # with them the kernels
+            number = 0 if pixels is None else pixels.start
+            sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
         if stage.pixels is None:
             lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
         else:
@@ -310,6 +317,7 @@ class Job:
 
         self.statistics.passes += 1
         self.statistics.spp += spp
+        self.weight += stage.weight * spp
         self.statistics.rays["camera"] += self._lanes(spp)
         return timer.has_new_kernels
 
@@ -357,7 +365,7 @@ class Job:
             if self.splats is None:
                 self.splats = self.film.create_block()
                 self.splats.set_coalesce(False)
-            camera.put_splats(self.film, self.splats, splats)
+            camera.put_splats(self.film, self.splats, splats, count)
         self._finish_take(sampler)
 
     def _rays(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> CameraRays:
@@ -409,7 +417,7 @@ class Job:
         self.film.put_block(self.block)
         if self.splats is not None and self.statistics.spp > 0:
             tensor, offset = self.splats.tensor(), self.splats.offset()
-            put_splats(self.film, tensor, offset, self.statistics.spp - self.forgotten)
+            put_splats(self.film, tensor, offset, self.weight)
 
     def _show(self) -> None:
         """Shows the image so far, if somebody watches and wants to see it now."""

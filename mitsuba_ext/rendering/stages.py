@@ -34,7 +34,7 @@ class Stage:
             memory; 0 for no limit. A pass still has at least one sample of each pixel. Passes of
             structured samplers ignore it.
         discards_earlier: Whether the samples of earlier stages are left out of the image, because
-            the samples of this one have far less variance.
+            the samples of this one have far less variance. It must not depend on those samples.
         observer: Is told when a pass begins. The estimator reports all other events to it.
         images: Gets the images of its passes, of which there are then three at least.
     """

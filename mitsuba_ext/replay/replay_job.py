@@ -161,9 +161,9 @@ class ReplayJob(Job):
                 for n in brightest_first(values[own])[: self._top]
             ], self._top)  # fmt: skip
         for splats in sample.splats:
-            self._record_splats(splats)
+            self._record_splats(splats, weight)
 
-    def _record_splats(self, splats: Splats) -> None:
+    def _record_splats(self, splats: Splats, weight: float) -> None:
         width, _height = film_extent(self.film)
         column = mi.Int32(dr.floor(splats.position.x)) - first_pixel(self.film)[0]
         row = mi.Int32(dr.floor(splats.position.y)) - first_pixel(self.film)[1]
@@ -179,7 +179,7 @@ class ReplayJob(Job):
                 nm = dr.gather(type(nm), nm, found)
             values = mi.Color3f(to_rgb(value, nm)).numpy().T.astype(np.float64)
             nm = nm.numpy().T if mi.is_spectral else np.zeros((len(values), 0))
-            record.splats.append(values)
+            record.splats.append(weight * values)
             record.keep([
                 Recorded(None, self._stage_index, values[n], 0.0, nm[n], None)
                 for n in brightest_first(values)[: self._top]

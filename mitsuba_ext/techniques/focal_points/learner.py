@@ -84,8 +84,6 @@ class FocalLearner(Learner):
         self._fitted: FocalScattering | None = None
         self._draws = rival is None
         self._effect: Effect | None = None
-        self._is_measured = False
-        self.discards_pilots = False
         self._summary = "no focal points: no path scatters"
 
     @property
@@ -113,7 +111,6 @@ class FocalLearner(Learner):
     # ---- Between the stages ----
 
     def learn(self, pilot: Pilot) -> FocalScattering | None:
-        self.discards_pilots = False
         records = self._records
         if records is None or self._fitted is None:
             return self.decision
@@ -156,9 +153,6 @@ class FocalLearner(Learner):
         if not pilot.pays(prediction):
             return False
         self._draws = self._draws or prediction.efficiency > self._rival.efficiency
-        if self._draws and not self._is_measured:
-            self._is_measured = True
-            self.discards_pilots = focal.sum() < verdicts.FAR_LESS * path.sum()
         return self._draws
 
     def _may_be_worth(self, lines: Lines, bsdf: mi.Float, pilot: Pilot) -> bool:
@@ -178,7 +172,6 @@ class FocalLearner(Learner):
             return False
         # Not where a few bright paths say so: half the error, because keyhole has one of 0.7
         is_far_less = prediction.variance * np.exp(prediction.error / 2) < verdicts.FAR_LESS
-        self.discards_pilots = is_far_less and pilot.is_last and not self._draws
         self._draws = self._draws or is_far_less or (
             pilot.is_last and prediction.efficiency > self._rival.efficiency
         )

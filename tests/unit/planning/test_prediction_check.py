@@ -57,7 +57,7 @@ def fill(images: PassImages, film: mi.Film, passes: int) -> None:
         value = mi.Float(2.0 * (rng.random(x.size) < 0.5))
         position = mi.Point2f(*(extent * rng.random((2, x.size)) - border))
         splats.put(position, [value, value, value, *[mi.Float(0)] * alpha, mi.Float(0)])
-        images.add(block, splats, _SPP * number)
+        images.add(block, splats, _SPP * number, 1.0)
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "tent"])
@@ -117,8 +117,9 @@ def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
 ) -> None:
     """Twice the efficiency of ``path``, where guides have three times that."""
     predicted = SimpleNamespace(
-        variances=np.array([1.0, 0.25]), uncertainty=np.zeros(2), of_path=np.ones(_SIZE**2)
-    )
+        variances=np.array([1.0, 0.25]), uncertainty=np.zeros(2), of_path=np.ones(_SIZE**2),
+        long_run=np.array([1.0, 0.25]),
+    )  # fmt: skip
     monkeypatch.setattr(PredictedErrors, "of", lambda *_: predicted)
     monkeypatch.setattr(light_paths, "cost", lambda techniques, _: 1 + techniques.light_paths)
     trial = LightPathTrial(film_of("box"), _SPP)
@@ -128,6 +129,8 @@ def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
     )  # fmt: skip
     choice = trial.choose(Rival(3.0, guides=3.0))
     assert (choice is None) == merges
+    # Whatever the pilots have made of guides
+    assert trial.discards_pilots
 
 
 def test_going_back_restores_the_guide_as_it_was() -> None:
@@ -144,7 +147,7 @@ def test_going_back_restores_the_guide_as_it_was() -> None:
     trial = SimpleNamespace(
         larger=lambda rival: None, choose=choose, check=None,
         leaves_out=lambda slot, finds_all_light: finds_all_light,
-        can_be_guided=False, chosen_variance=0.1, path_variance=None,
+        can_be_guided=False, discards_pilots=True, path_variance=None,
         reconsider=lambda rival: competing.append(rival.efficiency), effect=None,
         __str__=lambda: "",
     )  # fmt: skip

@@ -179,12 +179,7 @@ class LightPathTrial(Trial):
         self.predicted: PredictedErrors | None = None
         self.costs = np.zeros(0)
         self.check: PredictionCheck | None = None
-
-    @property
-    def chosen_variance(self) -> float:
-        """The variance of what was chosen, relative to ``path``; 0 if ``path`` cannot find some of
-        the light."""
-        return float(self.predicted.long_run[self._best])
+        self.discards_pilots = False
 
     @property
     def chosen_time(self) -> float:
@@ -261,7 +256,10 @@ class LightPathTrial(Trial):
             self.candidates.append(PHOTONS)
             times.append(cost(PHOTONS, photons.counts))
         self.costs = np.divide(times, times[0])
-        efficiencies = 1 / (predicted.variances * self.costs)
+        efficiencies, nothing = 1 / (predicted.variances * self.costs), np.ones(len(times))
+        alone, _ = verdicts.best(efficiencies, predicted.uncertainty, 1.0, nothing)
+        # Where ``path`` cannot find some of the light, this is 0
+        self.discards_pilots = bool(predicted.long_run[alone] < verdicts.FAR_LESS)
         guided = np.array([self._of_guides(candidate) for candidate in self.candidates])
         if self._has_photons:
             # Many candidates merge, or are photons, and leave out guides that others keep

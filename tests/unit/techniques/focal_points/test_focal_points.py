@@ -155,7 +155,7 @@ def _planner(**learners: Learner) -> Planner:
     techniques = {
         slot: SimpleNamespace(
             decision=lambda setting: None, learner=lambda *_, x=learner: x, doubles=False,
-            bytes_per_sample=0,
+            tries=True, bytes_per_sample=0,
         )
         for slot, learner in learners.items()
     }  # fmt: skip
@@ -164,16 +164,6 @@ def _planner(**learners: Learner) -> Planner:
     return Planner(
         techniques, setting, (1, 1, 2, 12), lambda *_: None, Decisions(), LearningPlan((1, 1, 2))
     )
-
-
-def test_pilots_do_not_count_once_they_are_far_noisier() -> None:
-    """A learner says so before the third stage."""
-    learner = _Idle("focal")
-    planner, discards = _planner(scattering=learner), []
-    for said in (False, False, True, False):
-        learner.discards_pilots = said
-        discards.append(planner.next_stage().discards_earlier)
-    assert discards == [False, False, True, False]
 
 
 def test_a_learner_replaces_others() -> None:
@@ -213,12 +203,11 @@ def _learner(monkeypatch, variance: float, rival: Any = None) -> FocalLearner:
 
 
 @pytest.mark.parametrize("variance", [0.3, 0.9])
-def test_pilots_count_if_focal_points_do_not_pay(variance: float, monkeypatch) -> None:
+def test_focal_points_are_dropped_if_they_do_not_pay(variance: float, monkeypatch) -> None:
     learner = _learner(monkeypatch, variance)
-    assert learner.decision is not None and not learner.discards_pilots
+    assert learner.decision is not None
     learner.learn(Pilot(None, False))
-    pays = variance < 0.5
-    assert learner.discards_pilots == pays and (learner.decision is not None) == pays
+    assert (learner.decision is not None) == (variance < 0.5)
 
 
 @pytest.mark.parametrize("variance, efficiency, replaces", [
