@@ -39,9 +39,6 @@ from .stages import Schedule, Stage
 from .statistics import PassTimer, RenderStatistics
 from .turns import let_others, tell
 
-#: Stands for a trial in the place of the number of a pass, which is smaller.
-_TRIAL = 0xFFFFFFFF
-
 
 def render(integrator: Staged, request: Request, job: type[Job] | None = None) -> mi.TensorXf:
     """Renders a scene with the estimators that ``integrator.schedule()`` makes. The statistics are
@@ -277,13 +274,11 @@ class Job:
 
     def _scout(self, stage: Stage, pixels: range | np.ndarray | None) -> None:
         sampler = mi.load_dict({"type": "independent"})
-        if stage.pixels is not None:
-            self._seed(sampler, _TRIAL, 1, pixels)
-        else:
-            # The same numbers for all seeds: the decisions of a scout change sizes of tables, and
-            # with them the kernels
-            number = 0 if pixels is None else pixels.start
-            sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
+        # The same numbers for all seeds: the decisions of a scout change sizes of tables, and with
+        # them the kernels. Images of different seeds are independent: none of these samples is a
+        # part of them
+        number = 0 if stage.pixels is not None or pixels is None else pixels.start
+        sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
         if stage.pixels is None:
             lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
         else:

@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.rendering.filter_weights import mean_weights
+from mitsuba_ext.rendering.render import render
+from mitsuba_ext.rendering.request import Request
+from mitsuba_ext.rendering.stages import Stage
 from mitsuba_ext.transport.estimator import Splats
+from tests.support.constant_renders import Constant, FixedSchedule, TwoStages
 from tests.support.stage import film, sensor, stage
 from tests.support.statistical import THRESHOLD, assert_same_image, batches, z_exact
 
@@ -71,6 +75,19 @@ def test_splats_are_right_on_average_with_one_camera_sample() -> None:
     images = batches(scene, _integrator((3, 0)), 1, range(1, 33))
     z, error = z_exact(images[:, 3:-3, 6:-3].mean(axis=(1, 2, 3)), 1.0)
     assert abs(z) < THRESHOLD and error < 0.005
+
+
+@pytest.mark.parametrize("changes", [{}, _GAUSSIAN], ids=["box", "gaussian"])
+def test_splats_weigh_as_much_as_the_samples_of_their_stage(changes: dict[str, Any]) -> None:
+    """Here, camera paths find all light in the first stage, and light paths in the second one."""
+    scene, integrator = _scene(**changes), TwoStages(pilot_spp=24)
+    light_paths = _Moved(Constant(1.0), (0, 0))
+    integrator.schedule = lambda *_: FixedSchedule(
+        Stage(Constant(1.0), weight=0.25), Stage(light_paths, weight=0.5)
+    )
+    image = render(integrator, Request(scene, scene.sensors()[0], 0, 64)).numpy()
+    # A gaussian filter spreads the splats unevenly
+    assert image[3:-3, 3:-3].mean() == pytest.approx(1, abs=0.003 if changes else 1e-5)
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)

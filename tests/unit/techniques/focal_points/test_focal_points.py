@@ -166,6 +166,15 @@ def _planner(**learners: Learner) -> Planner:
     )
 
 
+def test_pilots_weigh_less_whatever_they_find() -> None:
+    """If bright pilots were more likely to be left out, the image would be too dark."""
+    planner = _planner(scattering=_Idle("focal"))
+    stages = [planner.next_stage() for _ in range(4)]
+    weights = [stage.weight for stage in stages]
+    assert weights == sorted(weights) and weights[0] < 0.8 and weights[-1] == 1
+    assert not any(stage.discards_earlier for stage in stages)
+
+
 def test_a_learner_replaces_others() -> None:
     guide, focal = _Idle("guide"), _Idle("focal")
     planner = _planner(directions=guide, scattering=focal)
