@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.planning import verdicts
+from mitsuba_ext.estimators.light_paths.choice import light_paths
+from mitsuba_ext.planning import planner, verdicts
 from tests.support.stage import area, diffuse, film, lookat, rectangle, sensor
 from tests.support.statistical import THRESHOLD, batches, load, z_welch
 
@@ -62,6 +63,9 @@ def test_short_renders_have_the_right_mean(
 ) -> None:
     """Pilots have an eighth of the 64 samples."""
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
+    # Light paths are tried in such short renders, too
+    monkeypatch.setattr(planner, "LIGHT_PATH_KERNELS", 0.0)
+    monkeypatch.setattr(light_paths, "_LEAST_SPARSE", 1 << 10)
     loaded = _scene(scene)
 
     def means(name: str, spp: int, seeds: range) -> np.ndarray:
