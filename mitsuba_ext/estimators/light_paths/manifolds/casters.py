@@ -1,4 +1,4 @@
-"""The surfaces that cast caustics: smooth glass and smooth metal."""
+"""The surfaces that cast caustics: glass and metal, smooth or slightly rough."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ from ....util.arrays import from_numpy
 
 #: The BSDFs whose directions follow from the shading normal alone.
 _SMOOTH = ("SmoothConductor", "SmoothDielectric")
+#: The same, with a microfacet normal in the place of the shading normal.
+_ROUGH = ("RoughConductor", "RoughDielectric")
+#: Light through rougher surfaces is left to scattering and to connections from the surface itself.
+_MOST_ROUGHNESS = 0.2
 #: BSDFs that change the normal, let light pass straight, or add other lobes.
 _CHANGED = ("BumpMap", "NormalMap", "MaskBSDF", "BlendBSDF")
 #: The shapes, besides meshes, whose normals have derivatives in Mitsuba 3.9.1.
@@ -24,7 +28,7 @@ _SHAPES = ("Sphere", "Rectangle", "Disk", "Cylinder")
 _POINTS = 1024
 
 #: Words of a triangle: two edges and three normals. Words of a shape: see ``_shape_words``.
-_TRIANGLE, _SHAPE = 16, 16
+_TRIANGLE, _SHAPE, _ROUGHNESS = 16, 16, 12
 
 #: The entries of the table of shapes: no caster, a caster that is no mesh; from then on, the number
 #: of the first triangle.
@@ -40,6 +44,7 @@ class CasterPoint:
         normal, shading_normal: The geometric normal, of unknown sign, and the shading normal.
         eta: The relative index of refraction of the inside; 0 for metal.
         is_one_sided: Whether it reflects on the side of its normal only.
+        roughness: The parameter α of its microfacets; 0 where it is smooth.
     """
 
     p: mi.Point3f
@@ -47,6 +52,7 @@ class CasterPoint:
     shading_normal: mi.Normal3f
     eta: mi.Float
     is_one_sided: mi.Bool
+    roughness: mi.Float
 
 
 class Casters:
@@ -58,11 +64,12 @@ class Casters:
 
     Attributes:
         refract: Whether some of them are glass.
+        are_rough: Whether some of them are rough.
     """
 
     def __init__(self, shapes: list[mi.Shape]) -> None:
-        transmits = int(mi.BSDFFlags.DeltaTransmission)
-        self.refract = any(int(shape.bsdf().flags()) & transmits for shape in shapes)
+        self.refract = any(_transmits(shape.bsdf()) for shape in shapes)
+        self.are_rough = any(_roughness(shape.bsdf()) > 0 for shape in shapes)
         self._have_meshes = any(map(_has_triangles, shapes))
         ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
         table, words = np.zeros(max(ids) + 1, np.uint32), np.zeros((max(ids) + 1, _SHAPE))
@@ -84,6 +91,16 @@ class Casters:
     def contain(self, shape: mi.ShapePtr) -> mi.Bool:
         """Whether ``shape`` is a caster."""
         return self._entry(shape) != _NONE
+
+    def is_rough(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Whether ``shape`` is a rough caster."""
+        return self.roughness(shape) > 0
+
+    def roughness(self, shape: mi.ShapePtr) -> mi.Float:
+        """The parameter α of a caster; 0 for smooth ones, and for other shapes."""
+        index = dr.reinterpret_array(mi.UInt32, shape)
+        active = self._entry(shape) != _NONE
+        return dr.gather(mi.Float, self._shapes, index * _SHAPE + _ROUGHNESS, active)
 
     def meet(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
@@ -118,7 +135,9 @@ class Casters:
             n = dr.select(is_mesh, shading, n)
             flat = dr.cross(e1, e2)
             geometric = dr.select(is_mesh, flat * dr.rsqrt(dr.squared_norm(flat)), geometric)
-        point = CasterPoint(p, mi.Normal3f(geometric), mi.Normal3f(n), w[10], w[11] > 0)
+        point = CasterPoint(
+            p, mi.Normal3f(geometric), mi.Normal3f(n), w[10], w[11] > 0, w[_ROUGHNESS]
+        )
         return point, change
 
     def near(self, u: mi.Float, v: mi.Vector3f, w: mi.Float) -> mi.Point3f:
@@ -149,6 +168,8 @@ def _is_caster(shape: mi.Shape) -> bool:
     bsdf = shape.bsdf()
     if bsdf is None or not (_has_triangles(shape) or shape.class_name() in _SHAPES):
         return False
+    if 0 < (roughness := _roughness(bsdf)):
+        return roughness <= _MOST_ROUGHNESS
     if bsdf.class_name() == "TwoSidedBRDF":
         has_smooth_lobes = int(bsdf.flags()) & int(mi.BSDFFlags.Smooth)
         is_metal = contains_bsdf(bsdf, _SMOOTH) and not contains_bsdf(bsdf, _CHANGED)
@@ -165,9 +186,10 @@ def _shape_words(shape: mi.Shape) -> np.ndarray:
     """The words of a shape. The normal at p is n + curvature · (v - axis (axis · v)), where v =
     p - centre: words 0 to 2 are the centre, 3 to 5 the axis, 6 to 8 n, and 9 the curvature; they
     are 0 for meshes. 10: the relative index of refraction, 0 for metal. 11: whether only one side
-    reflects."""
-    words = np.zeros(_SHAPE)
-    words[10:12] = _eta(shape.bsdf()), shape.bsdf().class_name() == "SmoothConductor"
+    reflects. 12: the roughness."""
+    bsdf, words = shape.bsdf(), np.zeros(_SHAPE)
+    is_one_sided = bsdf.class_name() in ("SmoothConductor", "RoughConductor")
+    words[10:13] = _eta(bsdf), is_one_sided, _roughness(bsdf)
     if _has_triangles(shape):
         return words
     p, n = _some_points(shape)
@@ -185,9 +207,29 @@ def _shape_words(shape: mi.Shape) -> np.ndarray:
     return words
 
 
+def _transmits(bsdf: mi.BSDF) -> bool:
+    return bool(int(bsdf.flags()) & int(mi.BSDFFlags.Transmission))
+
+
+def _roughness(bsdf: mi.BSDF) -> float:
+    """The parameter α of rough metal or glass, the largest of all directions and both sides; 0 of
+    other BSDFs, and infinite where a texture has it, or where there are other lobes."""
+    if not contains_bsdf(bsdf, _ROUGH):
+        return 0.0
+    others = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Diffuse)
+    is_pure = bsdf.class_name() in ("TwoSidedBRDF", *_ROUGH)
+    if not is_pure or int(bsdf.flags()) & others or contains_bsdf(bsdf, _CHANGED):
+        return np.inf
+    parameters = mi.traverse(bsdf)
+    names = [key for key in parameters.keys() if "alpha" in key]
+    if not all(key.endswith(".value") for key in names):
+        return np.inf
+    return max(float(np.array(parameters[key]).max()) for key in names)
+
+
 def _eta(bsdf: mi.BSDF) -> float:
     """The relative index of refraction of the inside; 0 for metal."""
-    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission):
+    if not _transmits(bsdf):
         return 0.0
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = mi.Vector3f(0, 0, 1)

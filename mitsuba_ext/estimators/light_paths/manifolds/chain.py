@@ -1,4 +1,4 @@
-"""Specular chains: a ray that smooth surfaces reflect and refract, with its derivatives.
+"""Specular chains: a ray that casters reflect and refract, with its derivatives.
 
 Source: H. Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999, section 3.
 """
@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ....transport.bsdfs import sample_bsdf
+from ....transport.bsdfs import eval_bsdf, sample_bsdf
 from ....transport.path_channels import PathChannels
 from ....transport.path_decisions import SceneQuery
 from .casters import Casters
+from .microfacets import Microfacet, offset_at
 
 
 @dataclass
@@ -25,8 +26,10 @@ class RayState:
         p, d: The last vertex, and the direction in which the ray leaves it.
         o: Where a ray that leaves the vertex starts, clear of the surface.
         p_s, p_t, d_s, d_t: Derivatives of ``p`` and ``d``.
-        weight: Product of the values of the BSDFs; 1 if they were not asked.
-        chance: Product of the probabilities with which the BSDFs sample these directions, or 1.
+        weight: Product of the values of the BSDFs (1 if they were not asked), and of solid angles
+            per offset of rough casters, divided by the densities of offsets.
+        chance: The same product with the probabilities and densities with which the BSDFs sample
+            these directions.
         length: The number of surfaces.
         is_sound: Whether there is such a chain.
         first: The first point on a caster.
@@ -69,12 +72,13 @@ class Chains:
     def trace(
         self, start: mi.Ray3f, length: mi.UInt32, transmits: mi.UInt32, is_open: mi.Bool,
         active: mi.Bool, weighs: bool = False, channels: PathChannels | None = None,
+        offsets: mi.Vector4f | None = None,
     ) -> RayState:
         """The chain of ``length`` surfaces that begins with the ray ``start``. Bit i of
         ``transmits`` tells whether its surface i transmits or reflects. Where ``is_open``, the
         chain ends before the first surface that is no caster, and ``length`` is its longest
         length. BSDFs are asked only if it ``weighs`` the chain, and symbols of light path
-        expressions found only for ``channels``."""
+        expressions found only for ``channels``. ``offsets`` are needed if casters are rough."""
         frame = mi.Frame3f(start.d)
         ray = mi.Ray3f(start)
         state = RayState(
@@ -88,7 +92,7 @@ class Chains:
             pi = self._query.closest(self._scene, ray, coherent=False, active=going)
             met = going & pi.is_valid() & self._casters.contain(pi.shape)
             transmit = ((transmits >> state.length) & 1) == 1
-            sound = self._bend(state, ray, pi, transmit, met)
+            sound = self._bend(state, ray, pi, transmit, met, offsets)
             self._weigh(state, ray, pi, transmit, sound, weighs)
             self._read(state, pi, transmit, channels)
             ends = is_open & ~met & (state.length > 0)
@@ -99,11 +103,14 @@ class Chains:
             going = sound & (state.length < length)
         return state
 
-    def _bend(self, state, ray, pi, transmit, met) -> mi.Bool:
+    def _bend(self, state, ray, pi, transmit, met, offsets) -> mi.Bool:
         """Moves ``state`` along ``ray`` to the surface that it meets, and turns the ray there, with
         the derivatives. Returns whether the surface reflects or transmits it."""
         point, change = self._casters.meet(pi, ray, met)
-        n, is_glass = point.shading_normal, point.eta > 0
+        n, is_glass, facet = point.shading_normal, point.eta > 0, None
+        if offsets is not None:
+            facet = Microfacet(n, offset_at(offsets, state.length), point.roughness)
+            n = facet.normal
         front = -dr.dot(n, ray.d)
         side = dr.sign(front)
         m, c = n * side, dr.abs(front)
@@ -116,6 +123,14 @@ class Chains:
         sound &= transmit | ~point.is_one_sided | (front > 0)
         μ = e * c - cosine
         out = dr.normalize(e * ray.d + μ * m)
+        if facet is not None:
+            sound &= self._pass(point.shading_normal, n, transmit, ray.d, out)
+            # Solid angle of ``out`` per solid angle of normals (Eq. 14 and 17 of B. Walter et al.,
+            # *Microfacet Models for Refraction through Rough Surfaces*, EGSR 2007)
+            measure = facet.measure * dr.square(μ) / dr.abs(cosine)
+            measure = dr.select(sound & (point.roughness > 0), measure, 1)
+            state.weight *= measure
+            state.chance *= measure
         geometric = point.normal
         for i in ("s", "t"):
             dd, dp = getattr(state, "d_" + i), getattr(state, "p_" + i)
@@ -123,7 +138,8 @@ class Chains:
             dp = dp + pi.t * dd
             dp = dp - ray.d * (dr.dot(geometric, dp) / dr.dot(geometric, ray.d))
             # Reflection and refraction: out = e d + μ m
-            dm = change.along(dp) * side
+            dn = change.along(dp)
+            dm = (dn if facet is None else facet.change(dn)) * side
             dc = -(dr.dot(dd, m) + dr.dot(ray.d, dm))
             dμ = dr.select(transmit, e * dc - dr.square(e) * c * dc / cosine, 2 * dc)
             setattr(state, "p_" + i, dr.select(sound, dp, getattr(state, "p_" + i)))
@@ -135,6 +151,12 @@ class Chains:
         state.d = dr.select(sound, out, state.d)
         state.o = dr.select(sound, self._query.starts.along(si, out).o, state.o)
         return sound
+
+    def _pass(self, n: mi.Vector3f, m: mi.Vector3f, transmit, d, out) -> mi.Bool:
+        """Whether a ray is on the same sides of a microfacet with the normal ``m`` and of the
+        surface, whose shading normal is ``n``."""
+        before, behind = dr.dot(n, d), dr.dot(n, out)
+        return (before * dr.dot(m, d) > 0) & ((before * behind > 0) == transmit)
 
     def _weigh(self, state, ray, pi, transmit, sound, weighs: bool) -> None:
         """Multiplies weight and chance of ``state`` by the values of the surface it has met."""
@@ -148,8 +170,15 @@ class Chains:
             mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
         )  # fmt: skip
         agrees = (bs.pdf > 0) & ((bs.sampled_type & kind) != 0)
-        state.weight = dr.select(sound, state.weight * (weight * bs.pdf), state.weight)
-        state.chance = dr.select(sound, state.chance * bs.pdf, state.chance)
+        value, pdf = weight * bs.pdf, bs.pdf
+        if self._casters.are_rough:
+            is_rough = self._casters.is_rough(pi.shape)
+            wo = hit.to_local(state.d)
+            rough_value, rough_pdf = eval_bsdf(hit.bsdf(ray), self._ctx, hit, wo, sound & is_rough)
+            value, pdf = dr.select(is_rough, rough_value, value), dr.select(is_rough, rough_pdf, pdf)
+            agrees = dr.select(is_rough, rough_pdf > 0, agrees)
+        state.weight = dr.select(sound, state.weight * value, state.weight)
+        state.chance = dr.select(sound, state.chance * pdf, state.chance)
         state.is_sound &= ~sound | agrees
 
     def _read(self, state, pi, transmit, channels: PathChannels | None) -> None:

@@ -50,16 +50,15 @@ class ChosenVertices(Subpaths):
 
     Parameters:
         lanes: Number of paths.
-        most_surfaces: The most surfaces of a chain from a vertex at a depth.
+        connects: Tells whether a vertex has connections through casters.
         is_whole: Whether all fields of an interaction are stored.
         events: The number of states that light path expressions keep of a path; 0 without any.
     """
 
     def __init__(
-        self, lanes: int, most_surfaces: Callable[[mi.UInt32], mi.UInt32], is_whole: bool,
-        events: int = 0,
+        self, lanes: int, connects: Callable[[Vertex], mi.Bool], is_whole: bool, events: int = 0
     ) -> None:
-        self._most_surfaces, self._is_whole, self._events = most_surfaces, is_whole, events
+        self._connects, self._is_whole, self._events = connects, is_whole, events
         self._channels = dr.size_v(mi.Spectrum)
         self._size = self._channels + 3 + interaction_words(is_whole) + events
         self._words = dr.empty(mi.Float, lanes * self._size)
@@ -90,9 +89,7 @@ class ChosenVertices(Subpaths):
 
     def importance(self, vertex: Vertex) -> mi.Float:
         """The importance of a vertex; 0 where it has no connections through casters."""
-        connects = mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
-        connects &= self._most_surfaces(vertex.depth) > 0
-        return dr.select(connects, dr.max(vertex.path.β), 0)
+        return dr.select(self._connects(vertex), dr.max(vertex.path.β), 0)
 
     def schedule(self) -> None:
         """Schedules what is stored for evaluation."""

@@ -26,6 +26,7 @@ from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertex, ChosenVertices
+from .microfacets import offset_between, random_offsets, with_offset
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
 from .shares import counted, most_trials, share_of_scattering
@@ -93,12 +94,17 @@ class ManifoldConnections:
     def vertices(self, lanes: int, channels: PathChannels | None) -> ChosenVertices:
         """What a pass with ``lanes`` paths stores, empty."""
         events = 0 if channels is None else channels.colours
-        return ChosenVertices(lanes, self.most_surfaces, self._is_whole, events)
+        return ChosenVertices(lanes, self._connects, self._is_whole, events)
 
     def most_surfaces(self, depth: mi.UInt32) -> mi.UInt32:
         """The most surfaces of a chain that begins at a vertex at ``depth``."""
         used = dr.minimum(depth + 2, self._max_depth)
         return dr.minimum(self._max_depth - used, MOST_SURFACES)
+
+    def _connects(self, vertex: Vertex) -> mi.Bool:
+        """Whether a vertex has connections through casters. Rough casters have none."""
+        connects = vertex.is_smooth & (self.most_surfaces(vertex.depth) > 0)
+        return connects & ~self.is_rough(vertex.si) if self.are_rough else connects
 
     # ---- Connections ----
 
@@ -117,7 +123,9 @@ class ManifoldConnections:
         target = self._target(light)
         leaf = self._seeds.leaf(chosen.si.p, target, chosen.exists)
         most = self.most_surfaces(chosen.depth)
-        tasks = Tasks(Search(chosen.si, target, chosen.seed, most, leaf))
+        tasks = Tasks(
+            Search(chosen.si, target, chosen.seed, most, leaf, self._offsets(chosen.seed))
+        )
         searched = Queue(chosen.exists & (light.probability > 0))
         dr.eval(tasks.words)
         found = self._solver.find(tasks, searched)
@@ -174,7 +182,7 @@ class ManifoldConnections:
         start = self._query.starts.along(si, found.d)
         end = self._chains.trace(
             start, found.length, found.transmits, mi.Bool(False), active, weighs=True,
-            channels=channels,
+            channels=channels, offsets=self._offsets(chosen.seed),
         )
         miss = missed(end, target)
         active &= miss.is_sound
@@ -219,6 +227,9 @@ class ManifoldConnections:
         # Its weight contains the density of the disk on which light paths begin
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
 
+    def _offsets(self, seed: mi.UInt32) -> mi.Vector4f | None:
+        return random_offsets(seed) if self.are_rough else None
+
     def _seed(self, search: Search, trial: mi.UInt32) -> Seed:
         """Where a trial begins: at a learned seed, towards the light, towards a random point near a
         caster, or in a random direction on the side of that point. (Close to a caster, few points
@@ -258,7 +269,9 @@ class ManifoldConnections:
         vertex = dr.zeros(mi.SurfaceInteraction3f)
         vertex.p, vertex.n, vertex.wavelengths = h.p, h.n, some_wavelengths()
         start = self._query.starts.along(vertex, h.d)
-        chain = self._chains.trace(start, h.length, h.transmits, mi.Bool(False), active)
+        chain = self._chains.trace(
+            start, h.length, h.transmits, mi.Bool(False), active, offsets=h.offsets
+        )
         is_infinite = ~si.is_valid()
         target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
         miss = missed(chain, target)
@@ -272,11 +285,11 @@ class ManifoldConnections:
         direction *= self._emission.chance(index, active)
         by_us = dr.select(is_infinite, direction, position)
         cosine = dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
-        ratio = h.pdf * miss.density * cosine / by_us
+        ratio = h.pdf * chain.chance * miss.density * cosine / by_us
         active &= miss.is_sound & (ratio < 1)
         search = Search(
             vertex, target, _hash_of(h.d), self.most_surfaces(path.depth - h.length - 1),
-            self._seeds.leaf(h.p, target, active),
+            self._seeds.leaf(h.p, target, active), h.offsets,
         )  # fmt: skip
         chain = Found(h.d, h.length, h.transmits)
         most = most_trials(ratio, self._most_trials)
@@ -286,6 +299,26 @@ class ManifoldConnections:
     def passes(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether chains pass through this surface."""
         return self._casters.contain(si.shape)
+
+    @property
+    def are_rough(self) -> bool:
+        """Whether there are rough casters."""
+        return self._casters.are_rough
+
+    def is_rough(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether this surface is a rough caster."""
+        return self._casters.is_rough(si.shape)
+
+    def with_surface(
+        self, offsets: mi.Vector4f, index: mi.UInt32, si: mi.SurfaceInteraction3f,
+        bs: mi.BSDFSample3f, active: mi.Bool,
+    ) -> mi.Vector4f:
+        """``offsets``, with the offset of the surface ``si`` as number ``index`` of a chain, where
+        the direction ``bs`` was sampled."""
+        roughness = self._casters.roughness(si.shape)
+        wi, wo = si.to_world(si.wi), si.to_world(bs.wo)
+        offset = offset_between(wi, wo, si.sh_frame.n, bs.eta, roughness)
+        return with_offset(offsets, index, offset, active & (roughness > 0))
 
 
 class _HashedNumbers:

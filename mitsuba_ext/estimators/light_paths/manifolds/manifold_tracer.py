@@ -34,6 +34,7 @@ class History:
         transmits: Bit i tells whether caster i has transmitted the ray.
         lane: The number of the path.
         total: The importance of all vertices before.
+        offsets: The offsets of rough casters; ``None`` if all are smooth.
     """
 
     p: mi.Point3f
@@ -44,6 +45,7 @@ class History:
     transmits: mi.UInt32
     lane: mi.UInt32
     total: mi.Float
+    offsets: mi.Vector4f | None
 
 
 class ManifoldProgram(PathProgram):
@@ -66,26 +68,46 @@ class ManifoldProgram(PathProgram):
             mi.Point3f(ray.o), mi.Normal3f(0), mi.Vector3f(ray.d), mi.Float(0),
             mi.UInt32(_NEVER), mi.UInt32(0),
             dr.arange(mi.UInt32, self._lanes), mi.Float(0),
+            mi.Vector4f(0) if self._connections.are_rough else None,
         )  # fmt: skip
 
     def leave(self, vertex, bs):
         h, si = vertex.path.history, vertex.si
-        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
-        passes = self._connections.passes(si) & (h.length < MOST_SURFACES)
-        # Only chains of refractions have more than one surface
-        passes &= (h.length == 0) | (transmitted & (h.transmits != 0))
+        goes_on = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+        passes = self._continue(h, si, transmitted)
+        offsets = None
+        if self._connections.are_rough:
+            goes_on |= self._connections.is_rough(si)
+            offsets = self._connections.with_surface(h.offsets, h.length, si, bs, passes)
         bit = dr.select(transmitted, mi.UInt32(1) << h.length, 0)
         return History(
-            dr.select(is_delta, h.p, si.p),
-            dr.select(is_delta, h.n, si.n),
-            dr.select(is_delta, h.d, si.to_world(bs.wo)),
-            dr.select(is_delta, h.pdf, 1) * bs.pdf,
-            dr.select(is_delta, dr.select(passes, h.length + 1, _NEVER), 0),
-            dr.select(is_delta, h.transmits | bit, 0),
+            dr.select(goes_on, h.p, si.p),
+            dr.select(goes_on, h.n, si.n),
+            dr.select(goes_on, h.d, si.to_world(bs.wo)),
+            dr.select(goes_on, h.pdf, 1) * bs.pdf,
+            dr.select(goes_on, dr.select(passes, h.length + 1, _NEVER), 0),
+            dr.select(goes_on, h.transmits | bit, 0),
             h.lane,
             h.total + self.subpaths.importance(vertex),
+            offsets,
         )
+
+    def _continue(self, h: History, si, transmitted: mi.Bool) -> mi.Bool:
+        """Whether a path whose ray ``si`` transmits or reflects is still a chain."""
+        passes = self._connections.passes(si) & (h.length < MOST_SURFACES)
+        # Only chains of refractions have more than one surface
+        return passes & ((h.length == 0) | (transmitted & (h.transmits != 0)))
+
+    def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf):
+        mis = weights.connection(ds, pdf, scattering_pdf)
+        if not self._connections.are_rough:
+            return mis
+        # Chains belong to connections of the vertex before, and to scattering
+        h, si = vertex.path.history, vertex.si
+        transmitted = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(si.to_local(ds.d)) < 0
+        own = self._continue(h, si, transmitted) & self._connections.is_rough(si)
+        return dr.select(own, 0, mis)
 
     @dr.syntax
     def emission(self, weights, scene, si, ds, path, pdf):

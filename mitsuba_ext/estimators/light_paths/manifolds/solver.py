@@ -96,6 +96,7 @@ class Search:
         seed: The seed of the path's random numbers.
         most: The most surfaces of the chain.
         leaf: The leaf of learned seeds.
+        offsets: The offsets of its surfaces; ``None`` if all casters are smooth.
     """
 
     si: mi.SurfaceInteraction3f
@@ -103,6 +104,7 @@ class Search:
     seed: mi.UInt32
     most: mi.UInt32
     leaf: mi.UInt32
+    offsets: mi.Vector4f | None
 
 
 # Not a dataclass: loops only read it
@@ -111,11 +113,10 @@ class Tasks:
 
     Attributes:
         words: For each: the vertex (position and normal), the target, the seed of its random
-            numbers, the longest chain, with a bit for lights at infinity, and the leaf.
+            numbers, the longest chain, with a bit for lights at infinity, the leaf, and offsets.
         count: Number of paths.
     """
 
-    _WORDS = 12
     _INFINITE = 256
 
     def __init__(self, searches: Search) -> None:
@@ -123,18 +124,21 @@ class Tasks:
         mark = v.most | dr.select(v.target.is_infinite, mi.UInt32(self._INFINITE), 0)
         words = [*v.si.p, *v.si.n, *v.target.p, as_float(v.seed), as_float(mark)]
         words.append(as_float(v.leaf))
-        self.words = dr.empty(mi.Float, self.count * self._WORDS)
+        words += [] if v.offsets is None else [*v.offsets]
+        self._size = len(words)
+        self.words = dr.empty(mi.Float, self.count * self._size)
         dr.scatter(self.words, mi.ArrayXf(words), dr.arange(mi.UInt32, self.count))
 
     def at(self, path: mi.UInt32, active: mi.Bool) -> Search:
         """The search of a path."""
-        w = dr.gather(mi.ArrayXf, self.words, path, active, shape=(self._WORDS, dr.width(path)))
+        w = dr.gather(mi.ArrayXf, self.words, path, active, shape=(self._size, dr.width(path)))
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.p, si.n = mi.Point3f(w[0], w[1], w[2]), mi.Normal3f(w[3], w[4], w[5])
         si.wavelengths = some_wavelengths()
         seed, mark, leaf = (dr.reinterpret_array(mi.UInt32, w[i]) for i in (9, 10, 11))
         target = Target(mi.Point3f(w[6], w[7], w[8]), (mark & self._INFINITE) != 0)
-        return Search(si, target, seed, mark & (self._INFINITE - 1), leaf)
+        offsets = mi.Vector4f(*(w[i] for i in range(12, 16))) if self._size > 12 else None
+        return Search(si, target, seed, mark & (self._INFINITE - 1), leaf, offsets)
 
 
 @dataclass
@@ -320,7 +324,9 @@ class Solver:
         walk.error = dr.select(begins, dr.inf, walk.error)
         walk.share = dr.select(begins, 1, walk.share)
         ray = self._starts.along(search.si, d)
-        end = self._chains.trace(ray, length, walk.transmits, is_open, active)
+        end = self._chains.trace(
+            ray, length, walk.transmits, is_open, active, offsets=search.offsets
+        )
         walk.length = dr.select(begins, end.length, walk.length)
         miss = missed(end, search.target)
 
