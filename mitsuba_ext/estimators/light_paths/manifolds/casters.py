@@ -12,13 +12,14 @@ from ....scene.bsdfs import contains_bsdf
 from ....transport.bsdfs import sample_bsdf
 from ....transport.numbers import hashed_2d
 from ....util.arrays import from_numpy
+from .microfacets import offset_between
 
 #: The BSDFs whose directions follow from the shading normal alone.
 _SMOOTH = ("SmoothConductor", "SmoothDielectric")
 #: The same, with a microfacet normal in the place of the shading normal.
 _ROUGH = ("RoughConductor", "RoughDielectric")
 #: Light through rougher surfaces is left to scattering and to connections from the surface itself.
-_MOST_ROUGHNESS = 0.2
+_MOST_ROUGHNESS = 0.2001
 #: BSDFs that change the normal, let light pass straight, or add other lobes.
 _CHANGED = ("BumpMap", "NormalMap", "MaskBSDF", "BlendBSDF")
 #: The shapes, besides meshes, whose normals have derivatives in Mitsuba 3.9.1.
@@ -28,7 +29,8 @@ _SHAPES = ("Sphere", "Rectangle", "Disk", "Cylinder")
 _POINTS = 1024
 
 #: Words of a triangle: two edges and three normals. Words of a shape: see ``_shape_words``.
-_TRIANGLE, _SHAPE, _ROUGHNESS = 16, 16, 12
+_TRIANGLE, _SHAPE = 16, 16
+_ETA, _ROUGHNESS = 10, 12
 
 #: The entries of the table of shapes: no caster, a caster that is no mesh; from then on, the number
 #: of the first triangle.
@@ -94,13 +96,25 @@ class Casters:
 
     def is_rough(self, shape: mi.ShapePtr) -> mi.Bool:
         """Whether ``shape`` is a rough caster."""
-        return self.roughness(shape) > 0
+        return self._word(shape, _ROUGHNESS) > 0
 
-    def roughness(self, shape: mi.ShapePtr) -> mi.Float:
-        """The parameter α of a caster; 0 for smooth ones, and for other shapes."""
-        index = dr.reinterpret_array(mi.UInt32, shape)
-        active = self._entry(shape) != _NONE
-        return dr.gather(mi.Float, self._shapes, index * _SHAPE + _ROUGHNESS, active)
+    def offset(
+        self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, transmits: mi.Bool
+    ) -> mi.Vector2f:
+        """The offset of the microfacet that scatters light between ``si.wi`` and ``wo``; 0 where
+        the surface is no rough caster."""
+        eta, roughness = (self._word(si.shape, i) for i in (_ETA, _ROUGHNESS))
+        eta = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, eta, dr.rcp(eta))
+        offset = offset_between(
+            si.to_world(si.wi), si.to_world(wo), si.sh_frame.n, dr.select(transmits, eta, 1),
+            roughness,
+        )
+        return dr.select(roughness > 0, offset, 0)
+
+    def _word(self, shape: mi.ShapePtr, number: int) -> mi.Float:
+        """A word of a caster; 0 for other shapes."""
+        index, active = dr.reinterpret_array(mi.UInt32, shape), self.contain(shape)
+        return dr.gather(mi.Float, self._shapes, index * _SHAPE + number, active)
 
     def meet(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
@@ -136,7 +150,7 @@ class Casters:
             flat = dr.cross(e1, e2)
             geometric = dr.select(is_mesh, flat * dr.rsqrt(dr.squared_norm(flat)), geometric)
         point = CasterPoint(
-            p, mi.Normal3f(geometric), mi.Normal3f(n), w[10], w[11] > 0, w[_ROUGHNESS]
+            p, mi.Normal3f(geometric), mi.Normal3f(n), w[_ETA], w[11] > 0, w[_ROUGHNESS]
         )
         return point, change
 

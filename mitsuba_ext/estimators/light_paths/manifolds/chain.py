@@ -30,6 +30,8 @@ class RayState:
             per offset of rough casters, divided by the densities of offsets.
         chance: The same product with the probabilities and densities with which the BSDFs sample
             these directions.
+        by_last: 1 / density with which the last BSDF does, where it is rough; 0 where no connection
+            from there finds the light; ``None`` if all casters are smooth.
         length: The number of surfaces.
         is_sound: Whether there is such a chain.
         first: The first point on a caster.
@@ -49,6 +51,7 @@ class RayState:
     is_sound: mi.Bool
     first: mi.Point3f
     turns: mi.UInt32
+    by_last: mi.Float | None
 
     def symbols(self) -> list[tuple[mi.UInt32, mi.Bool]]:
         """The symbol of each surface, and whether there is one."""
@@ -85,7 +88,7 @@ class Chains:
             mi.Point3f(start.o), mi.Vector3f(start.d), mi.Point3f(start.o), mi.Vector3f(0),
             mi.Vector3f(0), mi.Vector3f(frame.s), mi.Vector3f(frame.t), mi.Spectrum(1),
             mi.Float(1), mi.UInt32(0), mi.Bool(active),
-            mi.Point3f(0), mi.UInt32(0),
+            mi.Point3f(0), mi.UInt32(0), mi.Float(0) if self._casters.are_rough else None,
         )
         going = mi.Bool(active) & (length > 0)
         while dr.hint(going, label="chain"):
@@ -173,10 +176,13 @@ class Chains:
         value, pdf = weight * bs.pdf, bs.pdf
         if self._casters.are_rough:
             is_rough = self._casters.is_rough(pi.shape)
-            wo = hit.to_local(state.d)
-            rough_value, rough_pdf = eval_bsdf(hit.bsdf(ray), self._ctx, hit, wo, sound & is_rough)
-            value, pdf = dr.select(is_rough, rough_value, value), dr.select(is_rough, rough_pdf, pdf)
-            agrees = dr.select(is_rough, rough_pdf > 0, agrees)
+            rough = eval_bsdf(
+                hit.bsdf(ray), self._ctx, hit, hit.to_local(state.d), sound & is_rough
+            )
+            value, pdf = (dr.select(is_rough, *pair) for pair in zip(rough, (value, pdf)))
+            agrees = dr.select(is_rough, pdf > 0, agrees)
+            by_last = dr.select(is_rough & (pdf > 0), dr.rcp(pdf), 0)
+            state.by_last = dr.select(sound, by_last, state.by_last)
         state.weight = dr.select(sound, state.weight * value, state.weight)
         state.chance = dr.select(sound, state.chance * pdf, state.chance)
         state.is_sound &= ~sound | agrees

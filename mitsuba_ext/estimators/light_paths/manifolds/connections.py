@@ -8,7 +8,7 @@ scattering finds counts where trials do not find its chain (``shares.py``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import drjit as dr
@@ -26,11 +26,12 @@ from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertex, ChosenVertices
-from .microfacets import offset_between, random_offsets, with_offset
+from .history import NEVER, History
+from .microfacets import is_offset, random_offsets, with_offset
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
 from .shares import counted, most_trials, share_of_scattering
-from .solver import Found, Queue, Search, Seed, Solver, Target, Tasks, missed
+from .solver import Found, Miss, Queue, Search, Seed, Solver, Target, Tasks, missed
 
 #: The most surfaces of a chain: in and out of a piece of glass.
 MOST_SURFACES = 2
@@ -191,8 +192,10 @@ class ManifoldConnections:
         by_us = light.probability * dr.select(
             light.is_infinite, light.pdf_direction, light.pdf_position
         )
-        ratio = pdf * end.chance * miss.density * cosine / by_us
-        ratio = dr.select(light.is_delta_position | light.is_delta_direction, 0, ratio)
+        is_delta = light.is_delta_position | light.is_delta_direction
+        ratio = self._ratio(
+            pdf * end.chance, end.by_last, end, miss, target, by_us, cosine, is_delta
+        )
         L = chosen.β * value * end.weight * emitted * miss.density
         tested = active & (dr.max(dr.abs(L)) > 0) & (ratio < 1)
         visible = tested & ~self._scene.ray_test(_last_ray(end, target), active=tested)
@@ -226,6 +229,28 @@ class ManifoldConnections:
         emitted = dr.select(is_point, intensity, emitted)
         # Its weight contains the density of the disk on which light paths begin
         return dr.select(light.is_infinite, light.weight * light.pdf_position, emitted), cosine
+
+    def _ratio(
+        self, pdf: mi.Float, by_last: mi.Float | None, end: RayState, miss: Miss, target: Target,
+        by_us: mi.Float, cosine: mi.Float, is_delta: mi.Bool,
+    ) -> mi.Float:
+        """The density with which other techniques find a chain / the density with which we choose
+        its end and its offsets.
+
+        Args:
+            pdf: The density with which scattering finds all directions of the chain, divided by the
+                densities of its offsets (as in :attr:`RayState.chance`).
+            by_last: See :class:`RayState`.
+            by_us: The density of the point on the light (of the direction, at infinity).
+            cosine: At the light.
+        """
+        if not self.are_rough:
+            return pdf * miss.density * dr.select(is_delta, 0, cosine / by_us)
+        # Connections know the interpolated normal of a light, scattering the geometric one: the
+        # ratio must be the same for both, and has no cosine
+        by_scattering = dr.select(is_delta, 0, dr.rcp(by_us))
+        distance = dr.select(target.is_infinite, 1, dr.squared_norm(target.p - end.o))
+        return pdf * miss.density * (by_scattering + distance * by_last)
 
     def _offsets(self, seed: mi.UInt32) -> mi.Vector4f | None:
         return random_offsets(seed) if self.are_rough else None
@@ -265,30 +290,53 @@ class ManifoldConnections:
         active: mi.Bool,
     ) -> mi.Float:
         """What counts of light at ``si`` that a path has hit through a chain."""
-        h = path.history
+        is_infinite = ~si.is_valid()
+        target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
+        n = dr.select(is_infinite, mi.Normal3f(-ds.d), self._emission.front(si))
+        arrival = path.arrival
+        by_last = dr.select(arrival.is_delta, 0, dr.rcp(arrival.pdf))
+        ref = mi.Interaction3f(arrival.ref)
+        return self._share(path.history, path.depth, target, ds, n, ref, by_last, active)
+
+    def weight_of_connection(
+        self, history: History, vertex: Vertex, ds: mi.DirectionSample3f, pdf: mi.Float,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """What counts of light to which the last vertex of a chain is connected. ``history``
+        contains it, and ``pdf`` is the density with which scattering finds the light."""
+        is_infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        target = Target(dr.select(is_infinite, mi.Point3f(ds.d), ds.p), is_infinite)
+        ref = mi.Interaction3f(vertex.si)
+        return self._share(
+            history, vertex.depth + 1, target, ds, ds.n, ref, dr.rcp(pdf), active
+        )
+
+    def _share(
+        self, h: History, depth: mi.UInt32, target: Target, ds: mi.DirectionSample3f,
+        n: mi.Normal3f, ref: mi.Interaction3f, by_last: mi.Float, active: mi.Bool,
+    ) -> mi.Float:
+        """The share of other techniques in the light of the chain ``h``, which ends in ``target``,
+        at ``depth``."""
         vertex = dr.zeros(mi.SurfaceInteraction3f)
         vertex.p, vertex.n, vertex.wavelengths = h.p, h.n, some_wavelengths()
         start = self._query.starts.along(vertex, h.d)
         chain = self._chains.trace(
             start, h.length, h.transmits, mi.Bool(False), active, offsets=h.offsets
         )
-        is_infinite = ~si.is_valid()
-        target = Target(dr.select(is_infinite, mi.Point3f(ds.d), si.p), is_infinite)
         miss = missed(chain, target)
-        n = dr.select(is_infinite, mi.Normal3f(-ds.d), self._emission.front(si))
         # Lights at infinity: the density of directions does not depend on the point
-        ref = mi.Interaction3f(path.arrival.ref)
         position, direction = self._emission.densities(
             self._scene, ds.emitter, -chain.d, n, ref, active, True
         )
         index = self._emission.index(ds.emitter, active)
         direction *= self._emission.chance(index, active)
-        by_us = dr.select(is_infinite, direction, position)
-        cosine = dr.select(is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
-        ratio = h.pdf * chain.chance * miss.density * cosine / by_us
+        by_us = dr.select(target.is_infinite, direction, position)
+        cosine = dr.select(target.is_infinite, 1, dr.abs(dr.dot(n, chain.d)))
+        pdf = h.pdf * chain.chance
+        ratio = self._ratio(pdf, by_last, chain, miss, target, by_us, cosine, ds.delta)
         active &= miss.is_sound & (ratio < 1)
         search = Search(
-            vertex, target, _hash_of(h.d), self.most_surfaces(path.depth - h.length - 1),
+            vertex, target, _hash_of(h.d), self.most_surfaces(depth - h.length - 1),
             self._seeds.leaf(h.p, target, active), h.offsets,
         )  # fmt: skip
         chain = Found(h.d, h.length, h.transmits)
@@ -296,9 +344,22 @@ class ManifoldConnections:
         trials = self._solver.find_again(search, chain, most, active)
         return dr.select(active, share_of_scattering(trials, ratio), 1)
 
-    def passes(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Whether chains pass through this surface."""
-        return self._casters.contain(si.shape)
+    def extended(
+        self, h: History, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, transmits: mi.Bool
+    ) -> tuple[History, mi.Bool]:
+        """``h`` with the surface ``si``, which scatters a path in the direction ``wo``; and whether
+        this is still a chain."""
+        passes = self._casters.contain(si.shape) & (h.length < MOST_SURFACES)
+        # Only chains of refractions have more than one surface
+        passes &= (h.length == 0) | (transmits & (h.transmits != 0))
+        offsets = None
+        if self.are_rough:
+            offset = self._casters.offset(si, wo, transmits)
+            passes &= is_offset(offset)
+            offsets = with_offset(h.offsets, h.length, offset)
+        bit = dr.select(transmits, mi.UInt32(1) << h.length, 0)
+        length = dr.select(passes, h.length + 1, NEVER)
+        return replace(h, length=length, transmits=h.transmits | bit, offsets=offsets), passes
 
     @property
     def are_rough(self) -> bool:
@@ -308,17 +369,6 @@ class ManifoldConnections:
     def is_rough(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether this surface is a rough caster."""
         return self._casters.is_rough(si.shape)
-
-    def with_surface(
-        self, offsets: mi.Vector4f, index: mi.UInt32, si: mi.SurfaceInteraction3f,
-        bs: mi.BSDFSample3f, active: mi.Bool,
-    ) -> mi.Vector4f:
-        """``offsets``, with the offset of the surface ``si`` as number ``index`` of a chain, where
-        the direction ``bs`` was sampled."""
-        roughness = self._casters.roughness(si.shape)
-        wi, wo = si.to_world(si.wi), si.to_world(bs.wo)
-        offset = offset_between(wi, wo, si.sh_frame.n, bs.eta, roughness)
-        return with_offset(offsets, index, offset, active & (roughness > 0))
 
 
 class _HashedNumbers:

@@ -15,37 +15,9 @@ from ....transport.numbers import Numbers, copied, go_to, reached, schedule_stat
 from ....transport.path_program import PathProgram
 from ....transport.walk import Walk
 from .chosen_vertices import ChosenVertices
-from .connections import MOST_SURFACES, ManifoldConnections
+from .connections import ManifoldConnections
+from .history import NEVER, History
 from .seed_learner import ChainRecords
-
-#: The number of surfaces of chains that no connection finds.
-_NEVER = 255
-
-
-@dataclass
-class History:
-    """The casters that a path has met since the last vertex that could be connected.
-
-    Attributes:
-        p, n: Position and normal of the vertex.
-        d: The direction in which the ray left it.
-        pdf: The density of the direction · the probabilities with which the casters were sampled.
-        length: The number of casters; ``_NEVER`` where no connection finds the path.
-        transmits: Bit i tells whether caster i has transmitted the ray.
-        lane: The number of the path.
-        total: The importance of all vertices before.
-        offsets: The offsets of rough casters; ``None`` if all are smooth.
-    """
-
-    p: mi.Point3f
-    n: mi.Normal3f
-    d: mi.Vector3f
-    pdf: mi.Float
-    length: mi.UInt32
-    transmits: mi.UInt32
-    lane: mi.UInt32
-    total: mi.Float
-    offsets: mi.Vector4f | None
 
 
 class ManifoldProgram(PathProgram):
@@ -66,7 +38,7 @@ class ManifoldProgram(PathProgram):
     def begin(self, ray):
         return History(
             mi.Point3f(ray.o), mi.Normal3f(0), mi.Vector3f(ray.d), mi.Float(0),
-            mi.UInt32(_NEVER), mi.UInt32(0),
+            mi.UInt32(NEVER), mi.UInt32(0),
             dr.arange(mi.UInt32, self._lanes), mi.Float(0),
             mi.Vector4f(0) if self._connections.are_rough else None,
         )  # fmt: skip
@@ -74,49 +46,45 @@ class ManifoldProgram(PathProgram):
     def leave(self, vertex, bs):
         h, si = vertex.path.history, vertex.si
         goes_on = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
-        passes = self._continue(h, si, transmitted)
-        offsets = None
         if self._connections.are_rough:
             goes_on |= self._connections.is_rough(si)
-            offsets = self._connections.with_surface(h.offsets, h.length, si, bs, passes)
-        bit = dr.select(transmitted, mi.UInt32(1) << h.length, 0)
-        return History(
-            dr.select(goes_on, h.p, si.p),
-            dr.select(goes_on, h.n, si.n),
-            dr.select(goes_on, h.d, si.to_world(bs.wo)),
-            dr.select(goes_on, h.pdf, 1) * bs.pdf,
-            dr.select(goes_on, dr.select(passes, h.length + 1, _NEVER), 0),
-            dr.select(goes_on, h.transmits | bit, 0),
-            h.lane,
-            h.total + self.subpaths.importance(vertex),
-            offsets,
+        transmits = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+        onward, _ = self._connections.extended(h, si, bs.wo, transmits)
+        begun = replace(
+            onward, p=si.p, n=si.n, d=si.to_world(bs.wo), pdf=mi.Float(1), length=mi.UInt32(0),
+            transmits=mi.UInt32(0),
         )
+        history = dr.select(goes_on, onward, begun)
+        history.pdf *= bs.pdf
+        history.total = h.total + self.subpaths.importance(vertex)
+        return history
 
-    def _continue(self, h: History, si, transmitted: mi.Bool) -> mi.Bool:
-        """Whether a path whose ray ``si`` transmits or reflects is still a chain."""
-        passes = self._connections.passes(si) & (h.length < MOST_SURFACES)
-        # Only chains of refractions have more than one surface
-        return passes & ((h.length == 0) | (transmitted & (h.transmits != 0)))
-
+    @dr.syntax
     def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf):
         mis = weights.connection(ds, pdf, scattering_pdf)
-        if not self._connections.are_rough:
-            return mis
-        # Chains belong to connections of the vertex before, and to scattering
-        h, si = vertex.path.history, vertex.si
-        transmitted = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(si.to_local(ds.d)) < 0
-        own = self._continue(h, si, transmitted) & self._connections.is_rough(si)
-        return dr.select(own, 0, mis)
+        if dr.hint(self._connections.are_rough, mode="scalar"):
+            h, si = vertex.path.history, vertex.si
+            wo = si.to_local(ds.d)
+            transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
+            onward, own = self._connections.extended(h, si, wo, transmits)
+            own &= self._connections.is_rough(si) & (pdf > 0) & (scattering_pdf > 0)
+            onward.pdf *= scattering_pdf
+            # A branch: few connections belong to chains
+            if dr.hint(own, label="connections in chains"):
+                mis *= self._connections.weight_of_connection(
+                    onward, vertex, ds, scattering_pdf, own
+                )
+        return mis
 
     @dr.syntax
     def emission(self, weights, scene, si, ds, path, pdf):
         length = path.history.length
-        own = (length > 0) & (length != _NEVER) & (ds.emitter != None)  # noqa: E711
+        own = (length > 0) & (length != NEVER) & (ds.emitter != None)  # noqa: E711
         mis = weights.emission(path.arrival.pdf, pdf)
         # A branch: few paths take it
         if dr.hint(own, label="weight of chains"):
-            mis = self._connections.weight(path, si, ds, own)
+            others = dr.select(path.arrival.is_delta, 1, mis)
+            mis = others * self._connections.weight(path, si, ds, own)
         return mis
 
 

@@ -17,8 +17,15 @@ import mitsuba as mi
 
 from ....transport.numbers import hashed_2d
 
+#: Chains with larger offsets are left to scattering and connections of rough surfaces. (A tenth of
+#: the light of the GGX distribution has larger ones.)
+_LARGEST = 3.0
+
 #: The numbers of hashes from which offsets come. No trial uses them.
 _OFFSETS = 0xFFFE0000
+
+#: The part of the GGX distribution whose slopes are not larger.
+_WITHIN = _LARGEST**2 / (1 + _LARGEST**2)
 
 #: The pole of all frames, and two axes perpendicular to it. Frames jump where a normal is
 #: perpendicular to the pole, so that the pole is not one that walls or floors are likely to have.
@@ -40,10 +47,10 @@ def offset_at(offsets: mi.Vector4f, index: mi.UInt32) -> mi.Vector2f:
 
 
 def with_offset(
-    offsets: mi.Vector4f, index: mi.UInt32, offset: mi.Vector2f, active: mi.Bool
+    offsets: mi.Vector4f, index: mi.UInt32, offset: mi.Vector2f
 ) -> mi.Vector4f:
     """``offsets``, with this offset for surface ``index``."""
-    first, second = active & (index == 0), active & (index == 1)
+    first, second = index == 0, index == 1
     return mi.Vector4f(
         dr.select(first, offset.x, offsets.x), dr.select(first, offset.y, offsets.y),
         dr.select(second, offset.x, offsets.z), dr.select(second, offset.y, offsets.w),
@@ -51,9 +58,14 @@ def with_offset(
 
 
 def offset_density(offset: mi.Vector2f) -> mi.Float:
-    """The density of offsets: the slopes of the GGX distribution. No distribution of Mitsuba is
-    more than 1.5 times as dense anywhere."""
-    return dr.inv_pi / dr.square(1 + dr.squared_norm(offset))
+    """The density of offsets: the slopes of the GGX distribution, up to the largest. No
+    distribution of Mitsuba is more than 1.5 times as dense anywhere."""
+    return dr.inv_pi / (_WITHIN * dr.square(1 + dr.squared_norm(offset)))
+
+
+def is_offset(offset: mi.Vector2f) -> mi.Bool:
+    """Whether this is no larger than the largest offset; false for NaN."""
+    return dr.squared_norm(offset) <= _LARGEST**2
 
 
 def offset_between(
@@ -74,8 +86,8 @@ def offset_between(
 
 
 def _slope(u: mi.Point2f) -> mi.Vector2f:
-    φ = dr.two_pi * u.y
-    return dr.sqrt(u.x / (1 - u.x)) * mi.Vector2f(dr.cos(φ), dr.sin(φ))
+    x, φ = _WITHIN * u.x, dr.two_pi * u.y
+    return dr.sqrt(x / (1 - x)) * mi.Vector2f(dr.cos(φ), dr.sin(φ))
 
 
 # Not a dataclass: it is no state of a loop
