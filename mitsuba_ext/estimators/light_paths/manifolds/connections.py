@@ -41,6 +41,10 @@ MOST_SURFACES = 2
 #: of glass); and the fraction that begins straight towards the light.
 _REFLECTED, _SINGLE, _STRAIGHT = 0.25, 0.1, 0.5
 
+#: The most trials of a chain whose last surface is rough: chains that need more are left to
+#: connections of that surface.
+_MOST_ROUGH_TRIALS = 64
+
 #: The numbers of hashes that no trial uses.
 _LIGHT_NUMBERS = 0xFFFF0000
 
@@ -250,7 +254,9 @@ class ManifoldConnections:
         # ratio must be the same for both, and has no cosine
         by_scattering = dr.select(is_delta, 0, dr.rcp(by_us))
         distance = dr.select(target.is_infinite, 1, dr.squared_norm(target.p - end.o))
-        return pdf * miss.density * (by_scattering + distance * by_last)
+        ratio = pdf * miss.density * (by_scattering + distance * by_last)
+        # Any ratio is unbiased, and this one bounds the number of trials
+        return dr.select(by_last > 0, dr.maximum(ratio, 1 / _MOST_ROUGH_TRIALS), ratio)
 
     def _offsets(self, seed: mi.UInt32) -> mi.Vector4f | None:
         return random_offsets(seed) if self.are_rough else None
