@@ -55,9 +55,8 @@ class ManifoldProgram(PathProgram):
             transmits=mi.UInt32(0),
         )
         history = dr.select(goes_on, onward, begun)
-        history.pdf *= bs.pdf
-        history.total = h.total + self.subpaths.importance(vertex)
-        return history
+        total = h.total + self.subpaths.importance(vertex)
+        return replace(history, pdf=history.pdf * bs.pdf, total=total)
 
     @dr.syntax
     def connection(self, weights, scene, vertex, ds, pdf, scattering_pdf):
@@ -68,7 +67,7 @@ class ManifoldProgram(PathProgram):
             transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
             onward, own = self._connections.extended(h, si, wo, transmits)
             own &= self._connections.is_rough(si) & (pdf > 0) & (scattering_pdf > 0)
-            onward.pdf *= scattering_pdf
+            onward = replace(onward, pdf=onward.pdf * scattering_pdf)
             # A branch: few connections belong to chains
             if dr.hint(own, label="connections in chains"):
                 mis *= self._connections.weight_of_connection(
