@@ -98,13 +98,13 @@ class ComposedPath(WalkIntegrator):
          begin. A sample takes 3 to 11 times as long as with :monosp:`path`.
          :monosp:`bounded_manifold` is **biased**: it ends the search for a chain after 64 trials,
          so that light that is rarely found makes no bright pixels, and is partly missing. The
-         surfaces are
-         meshes, spheres, rectangles, disks and cylinders that have a :monosp:`dielectric` or
-         :monosp:`conductor` without bump, normal or opacity map; other surfaces, instances, and
-         scenes that move or disperse light are left to scattering. Light of points and directions
-         that passes more than two surfaces is missing, as with :monosp:`scattered`. It refuses
-         participating media, and other :monosp:`scattering` than :monosp:`bsdf`. (Default:
-         scattered)
+         surfaces are meshes, spheres, rectangles, disks and cylinders that have a
+         :monosp:`dielectric`, :monosp:`conductor`, :monosp:`roughdielectric` or
+         :monosp:`roughconductor` without bump, normal or opacity map. The roughness of rough ones
+         has no texture, and is at most 0.1. Other surfaces, instances, and scenes that move or
+         disperse light are left to scattering. Light of points and directions that passes more
+         than two smooth surfaces is missing, as with :monosp:`scattered`. It refuses participating
+         media, and other :monosp:`scattering` than :monosp:`bsdf`. (Default: scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a

@@ -211,11 +211,15 @@ class PathEvents:
         """The cells of light paths that reach the sensor in the states ``others``."""
         return self._met([mi.UInt32(0)] * len(others), others)
 
-    # ---- Along a chain of smooth surfaces ----
+    # ---- Along a chain of casters ----
 
-    def specular(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
-        """The event at a smooth surface in a chain."""
-        return self._of_surface(shape, transmits)
+    def event(
+        self, shape: mi.ShapePtr, transmits: mi.Bool, is_rough: mi.Bool | bool
+    ) -> mi.UInt32:
+        """The event at a surface of a chain, which scatters light with a specular lobe, or with a
+        glossy one."""
+        kind = dr.select(is_rough, mi.UInt32(_GLOSSY), _SPECULAR)
+        return self._of_surface(shape, transmits) * _KINDS + kind
 
     def at_end(
         self,
@@ -227,7 +231,7 @@ class PathEvents:
         active: mi.Bool,
     ) -> list[mi.UInt32]:
         """The cells of a path that leaves ``vertex`` in the direction ``wo``, where the BSDF has
-        the value ``bsdf_value``, and is bent by smooth surfaces until it ends in ``emitter``.
+        the value ``bsdf_value``, and is bent by casters until it ends in ``emitter``.
 
         Args:
             chain: The event at each surface, and whether there is one.
@@ -237,10 +241,9 @@ class PathEvents:
             words = self._words(self._steps, states, self._column(vertex, wo))
             divides = active & self._divides(words)
             states = _states(words, self._chosen(vertex, wo, bsdf_value, divides))
-            for column, exists in chain:
-                behind = _states(
-                    self._words(self._steps, states, column), [mi.UInt32(_SPECULAR)]
-                )
+            for event, exists in chain:
+                words = self._words(self._steps, states, event // _KINDS)
+                behind = _states(words, [event % _KINDS])
                 states = [dr.select(exists, new, old) for new, old in zip(behind, states)]
         return self._ended(states, _looked_up(self._light_class, emitter))
 

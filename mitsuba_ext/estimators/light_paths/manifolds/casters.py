@@ -19,7 +19,7 @@ _SMOOTH = ("SmoothConductor", "SmoothDielectric")
 #: The same, with a microfacet normal in the place of the shading normal.
 _ROUGH = ("RoughConductor", "RoughDielectric")
 #: Light through rougher surfaces is left to scattering and to connections from the surface itself.
-_MOST_ROUGHNESS = 0.2001
+_MOST_ROUGHNESS = 0.1001
 #: BSDFs that change the normal, let light pass straight, or add other lobes.
 _CHANGED = ("BumpMap", "NormalMap", "MaskBSDF", "BlendBSDF")
 #: The shapes, besides meshes, whose normals have derivatives in Mitsuba 3.9.1.

@@ -190,7 +190,8 @@ class Chains:
     def _read(self, state, pi, transmit, channels: PathChannels | None) -> None:
         """Reads the symbol of the surface that ``state`` has met."""
         if channels is not None:
-            symbol = channels.specular(pi.shape, transmit)
+            is_rough = self._casters.is_rough(pi.shape) if self._casters.are_rough else False
+            symbol = channels.event(pi.shape, transmit, is_rough)
             state.turns |= dr.select(state.length < 2, symbol << (16 * state.length), 0)
 
 

@@ -11,9 +11,18 @@ import pytest
 
 from mitsuba_ext.estimators.light_paths.manifolds.casters import Casters, casters_of
 from mitsuba_ext.estimators.light_paths.manifolds.chain import Chains
+from mitsuba_ext.estimators.light_paths.manifolds.microfacets import random_offsets
 from mitsuba_ext.estimators.light_paths.manifolds.solver import Target, missed
 from mitsuba_ext.transport.queries.scene import scene_query
-from tests.support.casters import GLASS, lamp_above, plane_at, scene_of, wavy_surface
+from tests.support.casters import (
+    GLASS,
+    ROUGH_GLASS,
+    ROUGH_METAL,
+    lamp_above,
+    plane_at,
+    scene_of,
+    wavy_surface,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -23,6 +32,8 @@ def _casters() -> dict[str, Any]:
     return {
         "sphere": {"type": "sphere", "radius": 0.8, "bsdf": GLASS},
         "metal_sphere": {"type": "sphere", "radius": 0.8, "bsdf": metal},
+        "rough_sphere": {"type": "sphere", "radius": 0.8, "bsdf": ROUGH_GLASS},
+        "metal_rough_sphere": {"type": "sphere", "radius": 0.8, "bsdf": ROUGH_METAL},
         "plane": plane_at(0.0, GLASS),
         "cylinder": {
             "type": "cylinder", "p0": [-1, 0, 0], "p1": [1, 0, 0], "radius": 0.7, "bsdf": metal,
@@ -34,25 +45,27 @@ def _casters() -> dict[str, Any]:
 
 @pytest.mark.parametrize("transmits", [0, 1, 3])
 @pytest.mark.parametrize("kind", [
-    "sphere", "metal_sphere", "plane", "cylinder", "mesh", "mesh_with_coordinates",
+    "sphere", "metal_sphere", "rough_sphere", "metal_rough_sphere", "plane", "cylinder", "mesh",
+    "mesh_with_coordinates",
 ])  # fmt: skip
 def test_derivatives_of_chains_are_those_of_finite_differences(kind: str, transmits: int) -> None:
     caster = _casters()[kind]
     glass = not kind.startswith(("metal", "cylinder"))
     length = 2 if transmits == 3 else 1
-    if transmits and not glass or length == 2 and kind != "sphere":
+    if transmits and not glass or length == 2 and "sphere" not in kind:
         pytest.skip("no such chain")
     scene = scene_of(caster=caster, lamp=lamp_above())
     casters = Casters(casters_of(scene))
     chains = Chains(scene, scene_query(scene), casters, mi.BSDFContext())
     o, d = mi.Point3f(0.3, 0.2, 1.7), dr.normalize(mi.Vector3f(-0.22, -0.05, -1.0))
     frame, h = mi.Frame3f(d), 2e-3
+    offsets = mi.Vector4f(0.8, -0.5, 0.3, 1.2) if casters.are_rough else None
 
     def end(s: float, t: float):
         turned = dr.normalize(d + s * frame.s + t * frame.t)
         ray = mi.Ray3f(o, turned)
         return chains.trace(ray, mi.UInt32(length), mi.UInt32(transmits), mi.Bool(False),
-                            mi.Bool(True))  # fmt: skip
+                            mi.Bool(True), offsets=offsets)  # fmt: skip
 
     state = end(0, 0)
     assert state.is_sound[0] and state.length[0] == length
@@ -61,6 +74,29 @@ def test_derivatives_of_chains_are_those_of_finite_differences(kind: str, transm
             expected = (getattr(plus, what) - getattr(minus, what)) / (2 * h)
             found = np.array(getattr(state, f"{what}_{name}")).ravel()
             np.testing.assert_allclose(found, np.array(expected).ravel(), rtol=5e-3, atol=5e-3)
+
+
+@pytest.mark.parametrize("bsdf", [ROUGH_GLASS, ROUGH_METAL])
+def test_the_offset_of_a_sampled_direction_leads_a_chain_there(bsdf: dict[str, Any]) -> None:
+    """From outside and, in glass, from inside. The weight of a chain is the albedo of its
+    microfacet, up to shadowing and 1.5 for the densities."""
+    scene = scene_of(ball={"type": "sphere", "radius": 0.8, "bsdf": bsdf}, lamp=lamp_above())
+    casters = Casters(casters_of(scene))
+    chains = Chains(scene, scene_query(scene), casters, mi.BSDFContext())
+    offsets = random_offsets(dr.arange(mi.UInt32, 64))
+    for o, transmits in ([1.9, 0], [1.9, 1], [0.1, 1])[: 3 if bsdf is ROUGH_GLASS else 1]:
+        ray = mi.Ray3f(mi.Point3f(0.3, 0.2, o), dr.normalize(mi.Vector3f(-0.22, -0.05, -1.0)))
+        is_through = mi.Bool(transmits == 1)
+        end = chains.trace(ray, mi.UInt32(1), mi.UInt32(transmits), mi.Bool(False), mi.Bool(True),
+                           weighs=True, offsets=offsets)  # fmt: skip
+        sound = np.array(end.is_sound)
+        assert sound.mean() > 0.9
+        si = scene.ray_intersect(ray)
+        found = casters.offset(si, si.to_local(end.d), is_through)
+        np.testing.assert_allclose(
+            np.array(found)[:, sound], np.array(offsets)[:2, sound], rtol=1e-3, atol=1e-3
+        )
+        assert (np.array(end.chance)[sound] < 1.6).all()
 
 
 def test_a_chain_ends_where_its_last_ray_ends() -> None:

@@ -18,6 +18,8 @@ from tests.support.casters import (
     GLASS,
     GREY,
     MIRROR,
+    ROUGH_GLASS,
+    ROUGH_METAL,
     camera_at,
     lamp_above,
     plane_at,
@@ -100,12 +102,29 @@ def _statistical() -> dict[str, dict[str, Any]]:
         # A mesh without normals beside one with normals
         "slab": {"floor": floor, "slab": {**box, "bsdf": GLASS}, "wavy": wavy, "lamp": lamp},
         "lamp_in_glass": {"floor": floor, "ball": {**ball, "bsdf": GLASS}, "lamp": inner},
+        "rough_water": {"floor": floor, "water": plane_at(0.5, ROUGH_GLASS, 3.0), "lamp": lamp},
+        "rough_balls": {"floor": floor, "lamp": lamp, "ball": {**ball, "bsdf": ROUGH_GLASS},
+                        "metal": {"type": "sphere", "center": [0.7, 0, 0.3], "radius": 0.3,
+                                  "bsdf": ROUGH_METAL}},
     }  # fmt: skip
+
+
+def test_the_mean_through_rough_glass_is_the_mean_of_path() -> None:
+    """With a lamp so wide that scattering and connections of the water count half of the light."""
+    camera = camera_at([0.2, -0.5, 0.4], [0, 0, 0], 4, 45.0)
+    water = plane_at(0.5, ROUGH_GLASS, 3.0)
+    scene = scene_of(floor=plane_at(0.0, GREY), water=water, lamp=lamp_above(1.0), sensor=camera)
+    found = _render(scene, 8192, max_depth=3, pilot_spp=0).mean()
+    expected = _render(scene, 1 << 16, max_depth=3, caustics="scattered").mean()
+    # Both means are known to 0.5 %
+    np.testing.assert_allclose(found, expected, rtol=0.02)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("depth", [3, 4, 6])
-@pytest.mark.parametrize("name", ["water", "ball", "metal_ball", "tube", "slab", "lamp_in_glass"])
+@pytest.mark.parametrize("name", [
+    "water", "ball", "metal_ball", "tube", "slab", "lamp_in_glass", "rough_water", "rough_balls",
+])  # fmt: skip
 def test_the_mean_is_the_mean_of_path(name: str, depth: int) -> None:
     scene = scene_of(**_statistical()[name])
     _compare(scene, {"type": "path", "max_depth": depth}, 4096, depth)
@@ -156,7 +175,7 @@ def _compare(
 
 
 @pytest.mark.parametrize("bsdf", [
-    GREY, {"type": "roughdielectric"}, {"type": "thindielectric"},
+    GREY, {"type": "roughdielectric", "alpha": 0.3}, {"type": "thindielectric"},
     {"type": "mask", "nested": GLASS},
     {"type": "bumpmap", "nested": GLASS},
 ])  # fmt: skip
