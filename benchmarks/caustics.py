@@ -11,6 +11,8 @@ version, run this file with the Python of its environment.
 
 from __future__ import annotations
 
+import re
+import tempfile
 import time
 from pathlib import Path
 
@@ -32,6 +34,25 @@ CONTENDERS = {
 }
 
 
+def loaded(file: Path, roughness: float) -> mi.Scene:
+    """The scene; with this roughness of all its smooth glass and metal, if it is not 0."""
+    size = {"width": 192, "height": 108}
+    if roughness == 0:
+        return mi.load_file(str(file), **size)
+
+    def rough(tag: re.Match) -> str:
+        alpha = f'<float name="alpha" value="{roughness}"/>'
+        end = "</bsdf>" if tag[3] else ""
+        return f'type="rough{tag[1]}"{tag[2]}>{alpha}{end}'
+
+    text = re.sub(r'type="(dielectric|conductor)"([^>/]*)(/?)>', rough, file.read_text())
+    # In the same folder, where the scene finds its meshes and textures
+    with tempfile.NamedTemporaryFile("w", suffix=".xml", dir=file.parent) as changed:
+        changed.write(text)
+        changed.flush()
+        return mi.load_file(changed.name, **size)
+
+
 def relative(variance: np.ndarray, mean: np.ndarray) -> tuple[float, float]:
     """The mean relative variance of the pixels; the same without the 0.1 % that vary most. The mean
     is taken over 9x9 pixels: a spike would hide in the mean of its own pixel."""
@@ -40,10 +61,9 @@ def relative(variance: np.ndarray, mean: np.ndarray) -> tuple[float, float]:
 
 
 def measured(
-    file: Path, spp: int, seeds: int, names: list[str]
+    scene: mi.Scene, spp: int, seeds: int, names: list[str]
 ) -> dict[str, tuple[float, float, float]]:
     """Variance of a sample (all pixels; the others) and CPU time of a sample, by integrator."""
-    scene = mi.load_file(str(file), width=192, height=108)
     chosen = {name: CONTENDERS[name] for name in names}
     made = {name: mi.load_dict({**plugin, "max_depth": 8}) for name, (plugin, _) in chosen.items()}
     images: dict[str, list[np.ndarray]] = {name: [] for name in made}
@@ -69,8 +89,11 @@ def measured(
 @click.option("--spp", default=64, help="Samples per pixel of a render.")
 @click.option("--seeds", default=4, help="Renders of each integrator.")
 @click.option("--integrators", default="path,manifold,bounded,vcm", help="The first: the unit.")
+@click.option("--roughness", default=0.0, help="Of all smooth glass and metal.")
 @click.option("--variant", default="llvm_ad_rgb")
-def main(scenes: tuple[str, ...], spp: int, seeds: int, integrators: str, variant: str) -> None:
+def main(
+    scenes: tuple[str, ...], spp: int, seeds: int, integrators: str, roughness: float, variant: str
+) -> None:
     """Compares ``caustics=manifold`` with ``path`` and ``vcm``."""
     mi.set_variant(variant)
     folder = Path(__file__).parents[1] / "scenes"
@@ -78,7 +101,7 @@ def main(scenes: tuple[str, ...], spp: int, seeds: int, integrators: str, varian
     titles = [f"{what}, {name}" for name in names for what in ("variance", "time")]
     print_header(["scene", *titles, *(f"efficiency of {name}" for name in names[1:])])
     for scene in scenes or SCENES:
-        found = measured(folder / f"{scene}.xml", spp, seeds, names)
+        found = measured(loaded(folder / f"{scene}.xml", roughness), spp, seeds, names)
         whole, trimmed, seconds = found[names[0]]
         cells = []
         for name in names:

@@ -102,8 +102,8 @@ def no_effect(scene: mi.Scene, max_depth: int = _SHORTEST) -> str:
         return f'"max_depth" is {max_depth}, and such paths have at least {_SHORTEST} segments'
     if not casters_of(scene):
         return (
-            'no mesh, sphere, rectangle, disk or cylinder has a "dielectric" or "conductor", smooth '
-            "or with a roughness of at most 0.1, without bump, normal or opacity map"
+            'no mesh, sphere, rectangle, disk or cylinder has a "dielectric" or "conductor" (or a '
+            "rough one with a roughness of at most 0.1) without bump, normal or opacity map"
         )
     if movers(scene):
         return "things move"
