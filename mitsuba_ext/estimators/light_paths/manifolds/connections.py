@@ -9,7 +9,7 @@ scattering finds counts where trials do not find its chain (``shares.py``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import drjit as dr
@@ -27,15 +27,12 @@ from ..stored_interaction import needs_whole_interaction
 from .casters import Casters
 from .chain import Chains, RayState, some_wavelengths
 from .chosen_vertices import ChosenVertex, ChosenVertices
-from .history import NEVER, History
-from .microfacets import is_offset, random_offsets, with_offset
+from .history import MOST_SURFACES, History
+from .microfacets import random_offsets
 from .seed_learner import ChainRecords
 from .seeds import SeedMap
 from .shares import counted, most_trials, share_of_scattering
 from .solver import Found, Miss, Queue, Search, Seed, Solver, Target, Tasks, missed
-
-#: The most surfaces of a chain: in and out of a piece of glass.
-MOST_SURFACES = 2
 
 #: In a scene with glass: the fraction of trials that search for a reflection; of those that search
 #: for refractions, the fraction that stops at one surface though others follow (a lamp in a block
@@ -82,13 +79,16 @@ class ManifoldConnections:
         max_depth: Longest path in segments.
         seeds: Learned seeds.
         most_trials: Trials of a chain end after this number.
+
+    Attributes:
+        casters: The casters.
     """
 
     def __init__(
         self, scene: mi.Scene, query: SceneQuery, casters: Casters, max_depth: int, seeds: SeedMap,
         most_trials: int,
     ) -> None:
-        self._scene, self._query, self._casters, self._seeds = scene, query, casters, seeds
+        self._scene, self._query, self.casters, self._seeds = scene, query, casters, seeds
         self._ctx = Heroes(scene).context()
         self._emission = LightEmission(scene)
         self._max_depth = dr.opaque(mi.UInt32, max_depth)
@@ -268,12 +268,12 @@ class ManifoldConnections:
         lead to a chain, but many directions do.)"""
         si, target, seed = search.si, search.target, search.seed
         a, b, c, e = (hashed_2d(seed, trial * 4 + i) for i in range(4))
-        d = dr.normalize(self._casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
+        d = dr.normalize(self.casters.near(a.x, mi.Vector3f(b.x, b.y, a.y), e.x) - si.p)
         above = mi.Frame3f(dr.mulsign(mi.Vector3f(si.n), dr.dot(si.n, d)))
         is_random = self._seeds.is_left_out(e.y)
         d = dr.select(is_random, above.to_world(mi.warp.square_to_cosine_hemisphere(b)), d)
         transmits, length, is_open = mi.UInt32(0), mi.UInt32(1), mi.Bool(False)
-        if self._casters.refract:
+        if self.casters.refract:
             straight = dr.select(
                 target.is_infinite, mi.Vector3f(target.p), dr.normalize(target.p - si.p)
             )
@@ -351,31 +351,14 @@ class ManifoldConnections:
         trials = self._solver.find_again(search, chain, most, active)
         return dr.select(active, share_of_scattering(trials, ratio), 1)
 
-    def extended(
-        self, h: History, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, transmits: mi.Bool
-    ) -> tuple[History, mi.Bool]:
-        """``h`` with the surface ``si``, which scatters a path in the direction ``wo``; and whether
-        this is still a chain."""
-        passes = self._casters.contain(si.shape) & (h.length < MOST_SURFACES)
-        # Only chains of refractions have more than one surface
-        passes &= (h.length == 0) | (transmits & (h.transmits != 0))
-        offsets = None
-        if self.are_rough:
-            offset = self._casters.offset(si, wo, transmits)
-            passes &= is_offset(offset)
-            offsets = with_offset(h.offsets, h.length, offset)
-        bit = dr.select(transmits, mi.UInt32(1) << h.length, 0)
-        length = dr.select(passes, h.length + 1, NEVER)
-        return replace(h, length=length, transmits=h.transmits | bit, offsets=offsets), passes
-
     @property
     def are_rough(self) -> bool:
         """Whether there are rough casters."""
-        return self._casters.are_rough
+        return self.casters.are_rough
 
     def is_rough(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether this surface is a rough caster."""
-        return self._casters.is_rough(si.shape)
+        return self.casters.is_rough(si.shape)
 
 
 class _HashedNumbers:

@@ -49,7 +49,7 @@ class ManifoldProgram(PathProgram):
         if self._connections.are_rough:
             goes_on |= self._connections.is_rough(si)
         transmits = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
-        onward, _ = self._connections.extended(h, si, bs.wo, transmits)
+        onward, _ = h.past(self._connections.casters, si, bs.wo, transmits)
         begun = replace(
             onward, p=si.p, n=si.n, d=si.to_world(bs.wo), pdf=mi.Float(1), length=mi.UInt32(0),
             transmits=mi.UInt32(0),
@@ -65,7 +65,7 @@ class ManifoldProgram(PathProgram):
             h, si = vertex.path.history, vertex.si
             wo = si.to_local(ds.d)
             transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
-            onward, own = self._connections.extended(h, si, wo, transmits)
+            onward, own = h.past(self._connections.casters, si, wo, transmits)
             own &= self._connections.is_rough(si) & (pdf > 0) & (scattering_pdf > 0)
             onward = replace(onward, pdf=onward.pdf * scattering_pdf)
             # A branch: few connections belong to chains
