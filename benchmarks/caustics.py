@@ -31,6 +31,8 @@ CONTENDERS = {
     "manifold": ({"type": "composed_path", "caustics": "manifold"}, 1.0),
     "bounded": ({"type": "composed_path", "caustics": "bounded_manifold"}, 1.0),
     "vcm": ({"type": "vcm"}, 0.25),
+    "auto_path": ({"type": "auto_path"}, 1.0),
+    "scattered": ({"type": "auto_path", "caustics": "scattered"}, 1.0),
 }
 
 
@@ -75,7 +77,7 @@ def measured(
             image = np.array(mi.render(scene, integrator=integrator, spp=samples, seed=seed))
             seconds[name].append((time.process_time() - start) / samples)
             images[name].append(image.mean(-1))
-    mean = np.mean(images["manifold"][1:], 0)
+    mean = np.mean(images[names[1]][1:], 0)
     result = {}
     for name in made:
         samples = round(spp * chosen[name][1])

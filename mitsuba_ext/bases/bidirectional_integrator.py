@@ -217,9 +217,10 @@ class LightPathEstimators:
             next_event = side.next_event(next_event)
         else:
             next_event = next_event or side.correct
-        walk = integrator.walk(replace(decisions, next_event=next_event), observer)
+        decisions = replace(decisions, next_event=next_event)
         if not are_traced:
-            return walk
+            return integrator.estimator(decisions, observer)
+        walk = integrator.walk(decisions, observer)
         radii = None
         if techniques.merges:
             compares = choice.observer is not None and choice.observer.compares

@@ -198,7 +198,8 @@ class WalkIntegrator(StagedIntegrator):
         return verdicts.least_samples(device_of(mi.Float).is_gpu)
 
     def pace_stage(self, request: Request, spp: int) -> Stage | None:
-        if self.has_light_paths or "caustics" in self.slots:
+        caustics = self.slots.get("caustics")
+        if self.has_light_paths or (caustics is not None and not caustics.tries):
             # Camera paths alone would miss the light of some lights, and are much faster
             return None
         # Where maps help much, samples without them are worth less
@@ -285,7 +286,8 @@ class WalkIntegrator(StagedIntegrator):
         return self.estimator
 
     def estimator(self, decisions: Decisions, observer: Observer | None = None) -> Estimator:
-        """The estimator of a stage: :meth:`walk`, with what the slot ``caustics`` adds to it."""
+        """The estimator of a stage without light paths: :meth:`walk`, with what the slot
+        ``caustics`` adds to it."""
         walk = self.walk(decisions, observer)
         return walk if decisions.caustics is None else decisions.caustics.around(walk)
 
@@ -309,7 +311,8 @@ class WalkIntegrator(StagedIntegrator):
         Raises:
             NotImplementedError: The integrator has light paths, or connects through casters.
         """
-        if caustics := self.slots.get("caustics"):
+        caustics = self.slots.get("caustics")
+        if caustics is not None and not caustics.tries:
             raise NotImplementedError(
                 f'"{self.name}": the parameter "caustics" is "{caustics.name}", which connects all '
                 f"samples of a pass at once: it cannot be nested in an integrator that asks for "

@@ -47,6 +47,9 @@ MAP_ENTRY = 1 / 3
 #: 0.05, and learning them.
 SWARMING = 0.079
 
+#: The time of the first trial of a chain, and of each further one, in the unit of ``SEGMENT``.
+FIRST_CHAIN, CHAIN_TRIAL = 10.0, 5.0
+
 #: What a learned choice among vertices of light paths takes besides the time of a sample, as a
 #: share of it: 0.2, of which half is made up by MIS weights that rely on the connections (they
 #: double the predicted gain).

@@ -52,12 +52,15 @@ class ChosenVertices(Subpaths):
         lanes: Number of paths.
         connects: Tells whether a vertex has connections through casters.
         is_whole: Whether all fields of an interaction are stored.
+        stride: One in ``stride`` paths is connected.
         events: The number of states that light path expressions keep of a path; 0 without any.
     """
 
     def __init__(
-        self, lanes: int, connects: Callable[[Vertex], mi.Bool], is_whole: bool, events: int = 0
+        self, lanes: int, connects: Callable[[Vertex], mi.Bool], is_whole: bool,
+        stride: mi.UInt32, events: int = 0,
     ) -> None:
+        self._stride = stride
         self._connects, self._is_whole, self._events = connects, is_whole, events
         self._channels = dr.size_v(mi.Spectrum)
         self._size = self._channels + 3 + interaction_words(is_whole) + events
@@ -89,7 +92,12 @@ class ChosenVertices(Subpaths):
 
     def importance(self, vertex: Vertex) -> mi.Float:
         """The importance of a vertex; 0 where it has no connections through casters."""
-        return dr.select(self._connects(vertex), dr.max(vertex.path.β), 0)
+        connects = self._connects(vertex) & self.is_connected(vertex.path.history.lane)
+        return dr.select(connects, dr.max(vertex.path.β), 0)
+
+    def is_connected(self, path: mi.UInt32) -> mi.Bool:
+        """Whether a vertex of this path is connected."""
+        return path % self._stride == 0
 
     def schedule(self) -> None:
         """Schedules what is stored for evaluation."""

@@ -97,10 +97,12 @@ class ManifoldConnections:
         self._chains = Chains(scene, query, casters, self._ctx)
         self._solver = Solver(self._chains, query.starts, self._seed)
 
-    def vertices(self, lanes: int, channels: PathChannels | None) -> ChosenVertices:
-        """What a pass with ``lanes`` paths stores, empty."""
+    def vertices(
+        self, lanes: int, channels: PathChannels | None, stride: mi.UInt32
+    ) -> ChosenVertices:
+        """What a pass with ``lanes`` paths stores, empty. One in ``stride`` paths is connected."""
         events = 0 if channels is None else channels.colours
-        return ChosenVertices(lanes, self._connects, self._is_whole, events)
+        return ChosenVertices(lanes, self._connects, self._is_whole, stride, events)
 
     def most_surfaces(self, depth: mi.UInt32) -> mi.UInt32:
         """The most surfaces of a chain that begins at a vertex at ``depth``."""
@@ -158,7 +160,10 @@ class ManifoldConnections:
             return L, parts, shadow_count, None
         pattern = (found.length << 2) | found.transmits
         weight = dr.max(dr.abs(mi.unpolarized_spectrum(L)))
-        chains = ChainRecords(chosen.si.p, target.p, first, pattern, weight)
+        chains = ChainRecords(
+            chosen.si.p, target.p, first, pattern, weight,
+            dr.mean(mi.unpolarized_spectrum(light_of_path)), ratio, trials,
+        )  # fmt: skip
         return L, parts, shadow_count, chains
 
     def _chosen(

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ....rendering.device import SampleBytes, device_of
 from ....transport.estimator import CameraRays, Sample
 from ....transport.frozen import frozen
 from ....transport.numbers import Numbers, copied, go_to, reached, schedule_state
@@ -18,6 +19,12 @@ from .chosen_vertices import ChosenVertices
 from .connections import ManifoldConnections
 from .history import NEVER, History
 from .seed_learner import ChainRecords
+
+#: Bytes that a sample stores besides its ray: a vertex, a task and its result.
+SAMPLE_BYTES = 288
+
+#: Is told the chains (:class:`ChainRecords`), the samples and the pixels of a pass.
+Recorder = Callable[..., None]
 
 
 class ManifoldProgram(PathProgram):
@@ -67,6 +74,7 @@ class ManifoldProgram(PathProgram):
             transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
             onward, own = h.past(self._connections.casters, si, wo, transmits)
             own &= self._connections.is_rough(si) & (pdf > 0) & (scattering_pdf > 0)
+            own &= self.subpaths.is_connected(h.lane)
             onward = replace(onward, pdf=onward.pdf * scattering_pdf)
             # A branch: few connections belong to chains
             if dr.hint(own, label="connections in chains"):
@@ -79,6 +87,7 @@ class ManifoldProgram(PathProgram):
     def emission(self, weights, scene, si, ds, path, pdf):
         length = path.history.length
         own = (length > 0) & (length != NEVER) & (ds.emitter != None)  # noqa: E711
+        own &= self.subpaths.is_connected(path.history.lane)
         mis = weights.emission(path.arrival.pdf, pdf)
         # A branch: few paths take it
         if dr.hint(own, label="weight of chains"):
@@ -95,12 +104,20 @@ class ManifoldTracer:
     Parameters:
         walk: Traces the camera paths.
         connections: The connections.
-        record: Called with the chains of each pass; ``None`` if nothing learns from them.
+        record: Called with chains, samples and pixels of each pass; ``None`` if nothing learns
+            from them.
+        stride: One in ``stride`` paths is connected; the others are those of ``walk``.
     """
 
     walk: Walk
     connections: ManifoldConnections
-    record: Callable[[ChainRecords], None] | None = None
+    record: Recorder | None
+    stride: mi.UInt32
+
+    @property
+    def most_lanes(self) -> int:
+        """The most samples of a pass."""
+        return device_of(mi.Float).lanes(SampleBytes(SAMPLE_BYTES))
 
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
@@ -114,7 +131,7 @@ class ManifoldTracer:
         (sample, chains), place = trace(tracer, scene, sampler, rays, mi.Bool(active), records)
         go_to(sampler, place)
         if records:
-            self.record(chains)
+            self.record(chains, sample, rays.pixel)
         return sample
 
     def trace(
@@ -123,7 +140,7 @@ class ManifoldTracer:
         """The samples of these rays, and their chains if they are recorded."""
         lanes = dr.width(rays.ray)
         channels = self.walk.channels
-        vertices = self.connections.vertices(lanes, channels)
+        vertices = self.connections.vertices(lanes, channels, self.stride)
         program = ManifoldProgram(self.connections, vertices, lanes)
         walk = replace(self.walk, program=program)
         sample, direct = walk.unclamped(scene, sampler, rays, active)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ....planning.learner import Learner
+from ....transport.estimator import Sample
 from .seeds import SeedMap
 
 #: The most chains that are kept of each pass.
@@ -26,6 +27,7 @@ class ChainRecords:
         first: Its first point on a caster.
         pattern: Length · 4 + the bits of the surfaces that transmit.
         weight: The light that it brings; 0 where there is no chain.
+        light, ratio, trials: F, ratio and n of ``shares.py``; F is the mean of the channels.
     """
 
     vertex: mi.Point3f
@@ -33,6 +35,9 @@ class ChainRecords:
     first: mi.Point3f
     pattern: mi.UInt32
     weight: mi.Float
+    light: mi.Float
+    ratio: mi.Float
+    trials: mi.UInt32
 
     def to_host(self) -> np.ndarray:
         """The records of chains; shape [chains, 11]."""
@@ -50,8 +55,8 @@ class SeedLearner(Learner):
     """Learns seeds.
 
     Parameters:
-        make: Makes the decision from seeds, and from the function that takes the records of each
-            pass (``None`` after the last pilot).
+        make: Makes the decision from seeds, and from the function that takes the chains, samples
+            and pixels of each pass (``None`` after the last pilot).
     """
 
     def __init__(self, make: Callable[[SeedMap, Callable | None], Any]) -> None:
@@ -78,8 +83,8 @@ class SeedLearner(Learner):
     def finish(self):
         self._records = []
 
-    def _record(self, records: ChainRecords) -> None:
-        self._records.append(records.to_host())
+    def _record(self, chains: ChainRecords, sample: Sample, pixel: mi.UInt32) -> None:
+        self._records.append(chains.to_host())
 
     def __str__(self):
         if not len(self._map.seeds):

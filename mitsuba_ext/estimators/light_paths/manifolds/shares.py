@@ -12,6 +12,18 @@ counts n · ratio (at most 1), where trial n is the first of others to find its 
 and their sum is 1, whatever p is. Chains that trials do not find are left to scattering. (In
 caustic and ring, the variance is 1.00 times the one of the best weights for known p, which
 connections and scattering cannot use.)
+
+The trials of a connection also tell what scattering alone would cost. Let F be the light of a chain
+/ the density of the point on the light. Scattering brings F / ratio with the density ratio, where
+shares take it from F² / ratio to F² / ratio · Σ (1 - p)^(n-1) p (n · ratio)² in the second moment
+of a path. The difference, F² / ratio · Σ (1 - p)^(n-1) p (1 - (n · ratio)²), is the mean over
+connections, which find the chain with probability p, of
+
+    F² / ratio · Σ_{k ≤ n} (1 - (k · ratio)²),
+
+because trial k is made with probability (1 - p)^(k-1). Connections add the square of what they
+count, F² (Σ_{k ≤ n} (1 - k · ratio))². So connections alone, which find light of which scattering
+may show nothing in a pilot, tell by how much they reduce the variance.
 """
 
 from __future__ import annotations
@@ -38,3 +50,10 @@ def counted(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
     """What ``trials`` count for connections."""
     n = mi.Float(trials)
     return n - ratio * (0.5 * n * (n + 1))
+
+
+def taken_from_scattering(trials: mi.UInt32, ratio: mi.Float) -> mi.Float:
+    """By how much a connection with this number of ``trials`` reduces the second moment of light
+    that scattering finds, in units of F² / ratio."""
+    n = mi.Float(trials)
+    return n - dr.square(ratio) * (n * (n + 1) * (2 * n + 1) / 6)

@@ -12,6 +12,7 @@ from mitsuba_ext.estimators.light_paths.manifolds.shares import (
     counted,
     most_trials,
     share_of_scattering,
+    taken_from_scattering,
 )
 from mitsuba_ext.estimators.light_paths.manifolds.solver import Target
 from mitsuba_ext.util.stored_arrays import DamagedError, StoredArrays
@@ -83,6 +84,11 @@ def test_connections_and_scattering_share_all_light_of_a_chain(p: float, ratio: 
     total = p * np.array(by_us) + np.array(by_scattering)
     np.testing.assert_allclose((chance * total).sum(), 1, rtol=1e-4)
     assert (np.array(by_scattering) > 0).all() == (ratio > 0)
+    if ratio > 0:  # the second moment of scattering, as connections tell it
+        taken = p * np.array(taken_from_scattering(dr.minimum(n, most), mi.Float(ratio)))
+        np.testing.assert_allclose(
+            (chance * taken).sum(), (chance * (1 - np.array(by_scattering) ** 2)).sum(), rtol=1e-3
+        )
 
 
 def test_few_trials_lose_light_of_chains_that_they_rarely_find() -> None:
