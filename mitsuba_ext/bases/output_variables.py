@@ -23,6 +23,7 @@ class OutputVariables:
     Parameters:
         plugin: The integrator's name.
         aovs: The list (:class:`.scene.aovs.Aovs`).
+        no_expressions: Why it cannot render light path expressions; empty if it can.
 
     Attributes:
         channels: The light path expressions of the scene that was looked at last; ``None`` if there
@@ -30,10 +31,16 @@ class OutputVariables:
 
     Raises:
         ValueError: The list has an error.
+        NotImplementedError: It has light path expressions, which the integrator cannot render.
     """
 
-    def __init__(self, plugin: str, aovs: str) -> None:
+    def __init__(self, plugin: str, aovs: str, no_expressions: str = "") -> None:
         self._plugin, self._list = plugin, Aovs.read(plugin, aovs)
+        if self.has_expressions and no_expressions:
+            raise NotImplementedError(
+                f'"{plugin}": the parameter "aovs" has light path expressions, which it cannot '
+                f"render, because {no_expressions}"
+            )
         self._by_mitsuba: mi.Integrator | None = None
         if by_mitsuba := self._list.by_mitsuba:
             self._by_mitsuba = mi.load_dict({"type": "aov", "aovs": by_mitsuba})

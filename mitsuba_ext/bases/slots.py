@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import mitsuba as mi
@@ -11,6 +11,7 @@ from ..estimators.light_paths.choice import light_paths
 from ..estimators.light_paths.manifolds import parameters as manifolds
 from ..estimators.light_paths.subpath_choice import parameters as subpath_choice
 from ..planning.technique import ParameterReader, Technique
+from ..scene.media import refuse_media
 from ..techniques.focal_points import parameters as focal_points
 from ..techniques.guided_directions import parameters as guided_directions
 from ..techniques.learned_lights import parameters as learned_lights
@@ -123,6 +124,37 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> Technique | None:
         technique = maker(ParameterReader.of_defaults(plugin))
     technique.check_slot(plugin, slot)
     return technique
+
+
+def check_together(
+    plugin: str, techniques: Mapping[str, Technique], has_light_paths: bool
+) -> None:
+    """Checks that techniques, by slot, go together.
+
+    Raises:
+        TypeError, ValueError: Two exclude each other, or one excludes light paths.
+    """
+    for slot, technique in techniques.items():
+        technique.check_together(plugin, techniques)
+        if has_light_paths and technique.camera_paths_only:
+            raise ValueError(
+                f'"{plugin}": the parameter "{slot}" is "{technique.name}", which is for '
+                f"integrators without light paths"
+            )
+
+
+def refuse_media_in_slots(
+    plugin: str, techniques: Mapping[str, Technique], scene: mi.Scene
+) -> None:
+    """
+    Raises:
+        NotImplementedError: A technique does not support the participating media of ``scene``.
+    """
+    for slot, technique in techniques.items():
+        if not technique.sees_media:
+            what = f'"{plugin}": the parameter "{slot}" is "{technique.name}", which'
+            default = next(iter(_ALL_SLOTS[slot]))
+            refuse_media(scene, what, f'choose another one, such as "{default}"')
 
 
 def auto_techniques(plugin: str) -> dict[str, Technique]:

@@ -34,7 +34,7 @@ from ..transport.walk import Walk
 from .clamps import bias_by, clamped, read_clamps, refuse_expressions
 from .learned_state import LearnedState
 from .output_variables import OutputVariables
-from .slots import BIDIRECTIONAL_SLOTS, SLOTS
+from .slots import BIDIRECTIONAL_SLOTS, SLOTS, check_together, refuse_media_in_slots
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 
 #: Pilots are a quarter of all samples at most: with fewer samples per pixel, there is none.
@@ -103,7 +103,9 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = read("rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.clamps = read_clamps(self.name, props, read, self.can_clamp)
         self.aovs = read("aovs", "")
-        self.outputs = self._read_outputs()
+        self.outputs = OutputVariables(self.name, self.aovs, self.no_expressions)
+        if self.outputs.has_expressions:
+            refuse_expressions(self.name, self.clamps)
         self.slots: dict[str, Technique] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
@@ -129,13 +131,7 @@ class WalkIntegrator(StagedIntegrator):
         """
         known = (*SLOTS, *BIDIRECTIONAL_SLOTS)
         self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
-        for slot, parameters in self.slots.items():
-            parameters.check_together(self.name, self.slots)
-            if self.has_light_paths and parameters.camera_paths_only:
-                raise ValueError(
-                    f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
-                    f"integrators without light paths"
-                )
+        check_together(self.name, self.slots, self.has_light_paths)
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             read = self.reader(props)
@@ -379,17 +375,6 @@ class WalkIntegrator(StagedIntegrator):
 
     # ---- Helpers ----
 
-    def _read_outputs(self) -> OutputVariables:
-        outputs = OutputVariables(self.name, self.aovs)
-        if outputs.has_expressions and self.no_expressions:
-            raise NotImplementedError(
-                f'"{self.name}": the parameter "aovs" has light path expressions, which it cannot '
-                f"render, because {self.no_expressions}"
-            )
-        if outputs.has_expressions:
-            refuse_expressions(self.name, self.clamps)
-        return outputs
-
     def _described_slots(self) -> dict[str, str]:
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
@@ -410,9 +395,5 @@ class WalkIntegrator(StagedIntegrator):
             )  # fmt: skip
         if not self.sees_media:
             refuse_media(scene, f'"{self.name}"', 'use "composed_path" or "volpath"')
-        for slot, parameters in self.slots.items():
-            if not parameters.sees_media:
-                what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
-                default = next(iter({**SLOTS, **BIDIRECTIONAL_SLOTS}[slot]))
-                refuse_media(scene, what, f'choose another one, such as "{default}"')
+        refuse_media_in_slots(self.name, self.slots, scene)
         refuse_moving_grids(scene, f'"{self.name}"')

@@ -26,7 +26,8 @@ import mitsuba as mi
 
 from ..scene.media import may_have_grids, may_have_media
 from .free_flight import Distances, attenuation, shared_mean
-from .media import Media, NoMedia
+from .media import Media
+from .no_media import NoMedia
 
 
 class ChromaticMedia(Media):

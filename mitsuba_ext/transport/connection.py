@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .heroes import Heroes
-from .media import NoMedia
+from .no_media import NoMedia
 from .observer import Observer
 from .path_channels import PathChannels
 from .path_decisions import (

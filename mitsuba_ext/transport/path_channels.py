@@ -15,7 +15,8 @@ from ..scene.expressions.notation import Expression
 from ..util.arrays import from_numpy
 from ..util.spectra import film_colours
 from .estimator import CameraRays
-from .path_events import PathEvents, any_of
+from .event_tables import any_of
+from .path_events import PathEvents
 from .vertex import PathState, Vertex
 
 

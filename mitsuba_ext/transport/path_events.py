@@ -1,5 +1,5 @@
 """Light path expressions in the random walk: each path keeps the state of the automaton that reads
-its events (``scene/expressions``).
+its events (``scene/expressions``) in tables (``event_tables.py``).
 
 **What an event is.** Media scatter with ``V``. At a surface, the two directions give the type:
 ``R`` if they are on one side of the surface, otherwise ``T``. The lobe gives the scattering. Delta
@@ -21,43 +21,37 @@ partition of all paths adds up to the image, sample by sample.
 
 Random numbers come from a hash of the position and the direction. The sampler's numbers, and with
 them the image, are the same as without expressions.
-
-**Tables.** Kernels look up one word for all kinds of lobes: a *column* is what happens at a vertex
-except for the lobe, and the word of a state and a column has the next state for each kind.
 """
 
 from __future__ import annotations
 
-import functools
-import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..scene.bsdfs import has_glossy_lobes, mixes_lobes, undivided_bsdfs
-from ..scene.expressions.alphabet import PER_CLASS, STRAIGHT, VOLUME, Alphabet
-from ..scene.expressions.automaton import MOST_STATES, Automaton
+from ..scene.expressions.alphabet import Alphabet
+from ..scene.expressions.automaton import Automaton
 from ..scene.expressions.notation import Expression
 from ..util.arrays import from_numpy
 from .bsdfs import DiffuseLobes, diffuse_share
+from .event_tables import (
+    COLUMNS,
+    DIFFUSE,
+    GLOSSY,
+    KINDS,
+    PASSES,
+    SCATTERS,
+    SPECULAR,
+    TRANSMITS,
+    EventTables,
+    depends_on_lobe,
+    states_in,
+)
 from .heroes import Heroes
 from .vertex import MediumVertex, PathState, Vertex
-
-#: The kinds of lobes, in the order of the alphabet's symbols, and their number.
-_DIFFUSE, _GLOSSY, _SPECULAR, _KINDS = 0, 1, 2, 3
-
-#: The columns of a class of surfaces: ``R`` and ``T``, and two that do not depend on the surface.
-_TRANSMITS, _SCATTERS, _PASSES, _COLUMNS = 1, 2, 3, 4
-
-#: The bits of a state and of a cell in a word.
-_STATE_BITS, _CELL_BITS = 10, 16
-assert MOST_STATES <= 1 << _STATE_BITS
-
-#: The most words of the table of connections.
-_MOST_WORDS = 1 << 24
 
 
 # Not a dataclass: Dr.Jit would treat a dataclass used in a loop as part of the loop's state
@@ -80,30 +74,10 @@ class PathEvents:
         automaton = Automaton.of(expressions, alphabet.vertices, alphabet.lights)
         self._surface_class = alphabet.surface_class
         self.cells = automaton.cells
-        steps, back = (_by_kind(table) for table in (automaton.next, automaton.back))
-        # Lights that no expression tells apart are one
-        ends = np.concatenate([automaton.ends, automaton.begins[None]])
-        ends, light_class = np.unique(ends, axis=1, return_inverse=True)
-        ends, begins = ends[:-1], ends[-1]
-        light_class = light_class.reshape(-1)[alphabet.light_class.numpy()]
+        self._tables = tables = EventTables(automaton)
+        light_class = tables.light_class[alphabet.light_class.numpy()]
         self._light_class = from_numpy(mi.UInt32, light_class) if light_class.any() else None
-        self._columns, self._lights = steps.shape[1], ends.shape[1]
-        self._steps, self._back = (
-            _packed(np.moveaxis(table, 2, 0), _STATE_BITS) for table in (steps, back)
-        )
-        if steps[..., 0].size * self._lights > _MOST_WORDS or len(self.cells) >> _CELL_BITS:
-            raise ValueError(
-                "the light path expressions need too large a table: render fewer expressions at "
-                "once, or name fewer lights and surfaces in them"
-            )
-        lit = ends[steps[..., :_SPECULAR]]
-        self._lit = _packed(np.moveaxis(lit, 2, 0), _CELL_BITS)
-        self._ends, self._begins = (from_numpy(mi.UInt32, table) for table in (ends, begins))
-        self._pairs, self._backs = from_numpy(mi.UInt32, automaton.pairs), len(back)
-        self._reads = len(steps) > 1
-        self._sees_lobes = has_glossy_lobes(scene) and any(
-            bool((table[..., _DIFFUSE] != table[..., _GLOSSY]).any()) for table in (steps, back)
-        )
+        self._sees_lobes = has_glossy_lobes(scene) and tables.tell_lobes_apart
         self._mixes = self._sees_lobes and mixes_lobes(scene)
         self._undivided = undivided_bsdfs(scene) if self._mixes else None
         heroes = Heroes(scene)
@@ -125,14 +99,14 @@ class PathEvents:
     ) -> list[mi.UInt32]:
         """The state behind ``vertex``, in the direction ``bs`` that was sampled there. ``weight``
         is the BSDF's value in this direction / density."""
-        if not self._reads:
+        if not self._tables.reads:
             return vertex.path.events
         known = vertex.lobes and vertex.lobes.sampled
-        return self._sampled(self._steps, vertex, bs, bs.wo, weight * bs.pdf, active, known)
+        return self._sampled(self._tables.steps, vertex, bs, bs.wo, weight * bs.pdf, active, known)
 
     def at_light(self, path: PathState, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
         """The cells of a path that hits a light."""
-        return self._ended(path.events, _looked_up(self._light_class, emitter))
+        return self._tables.ended(path.events, _looked_up(self._light_class, emitter))
 
     def at_connection(
         self, vertex: Vertex, wo: mi.Vector3f, emitter: mi.EmitterPtr
@@ -140,22 +114,16 @@ class PathEvents:
         """The cells of a path whose last ``vertex`` was connected to a light, in the direction
         ``wo``: if it scatters with a diffuse lobe there, and with a glossy one."""
         light = _looked_up(self._light_class, emitter)
-        if not self._reads:
-            cells = self._ended(vertex.path.events, light)
+        if not self._tables.reads:
+            cells = self._tables.ended(vertex.path.events, light)
             return cells, cells
-        column = self._column(vertex, wo)
-        words = [
-            dr.gather(mi.UInt32, self._lit, (s * self._columns + column) * self._lights + light)
-            for s in vertex.path.events
-        ]
-        mask = (1 << _CELL_BITS) - 1
-        return [word & mask for word in words], [word >> _CELL_BITS for word in words]
+        return self._tables.lit(vertex.path.events, self._column(vertex, wo), light)
 
     # ---- Along a light path ----
 
     def begin_light(self, emitter: mi.EmitterPtr) -> list[mi.UInt32]:
         """The state of the backward automaton behind a light."""
-        state = dr.gather(mi.UInt32, self._begins, _looked_up(self._light_class, emitter))
+        state = dr.gather(mi.UInt32, self._tables.begins, _looked_up(self._light_class, emitter))
         return [mi.UInt32(state) for _ in range(self.colours)]
 
     def left_by_light(
@@ -163,25 +131,26 @@ class PathEvents:
     ) -> list[mi.UInt32]:
         """The state of a light path behind ``vertex``, in the direction ``bs`` that was sampled
         there."""
-        if self._backs == 1:
+        if not self._tables.reads_back:
             return vertex.path.events
         reverse = _reversed(vertex, bs.wo)
-        return self._sampled(self._back, reverse, bs, vertex.si.wi, None, active)
+        return self._sampled(self._tables.back, reverse, bs, vertex.si.wi, None, active)
 
     def past(
         self, vertex: Any, to_camera: mi.Vector3f, active: mi.Bool
     ) -> list[mi.UInt32]:
         """The state of a light path behind its last ``vertex``, in the direction in which it is
         connected. ``vertex`` is a stored one."""
-        if self._backs == 1:
+        if not self._tables.reads_back:
             return vertex.events
         at = Vertex(vertex.si, vertex.si.bsdf(), PathState(*[None] * 6, events=vertex.events))
         if vertex.medium is not None:
             in_medium = vertex.si.shape == None  # noqa: E711
             at.medium = MediumVertex(in_medium, dr.zeros(mi.MediumInteraction3f))
         reverse, wo = _reversed(at, to_camera), vertex.si.wi
-        words = self._words(self._back, vertex.events, self._column(reverse, wo))
-        return _states(words, self._chosen(reverse, wo, None, active & self._divides(words)))
+        tables = self._tables
+        words = tables.words(tables.back, vertex.events, self._column(reverse, wo))
+        return states_in(words, self._chosen(reverse, wo, None, active & depends_on_lobe(words)))
 
     # ---- Where a camera path meets a light path ----
 
@@ -190,26 +159,27 @@ class PathEvents:
     ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
         """As :meth:`at_connection`, for a path that is joined with light paths in the states
         ``others``."""
-        if not self._reads:
-            cells = self._met(vertex.path.events, others)
+        tables = self._tables
+        if not tables.reads:
+            cells = tables.met(vertex.path.events, others)
             return cells, cells
-        words = self._words(self._steps, vertex.path.events, self._column(vertex, wo))
-        kinds = ([mi.UInt32(kind)] for kind in (_DIFFUSE, _GLOSSY))
-        diffuse, glossy = (self._met(_states(words, kind), others) for kind in kinds)
+        words = tables.words(tables.steps, vertex.path.events, self._column(vertex, wo))
+        kinds = ([mi.UInt32(kind)] for kind in (DIFFUSE, GLOSSY))
+        diffuse, glossy = (tables.met(states_in(words, kind), others) for kind in kinds)
         return diffuse, glossy
 
     def in_medium(self, path: PathState, others: list[mi.UInt32]) -> list[mi.UInt32]:
         """The cells of a path that is joined with light paths at a point of a medium, on the way
         to its next vertex."""
-        states = path.events
-        if self._reads:
-            words = self._words(self._steps, states, mi.UInt32(_SCATTERS))
-            states = _states(words, [mi.UInt32(_DIFFUSE)])
-        return self._met(states, others)
+        states, tables = path.events, self._tables
+        if tables.reads:
+            words = tables.words(tables.steps, states, mi.UInt32(SCATTERS))
+            states = states_in(words, [mi.UInt32(DIFFUSE)])
+        return tables.met(states, others)
 
     def at_camera(self, others: list[mi.UInt32]) -> list[mi.UInt32]:
         """The cells of light paths that reach the sensor in the states ``others``."""
-        return self._met([mi.UInt32(0)] * len(others), others)
+        return self._tables.met([mi.UInt32(0)] * len(others), others)
 
     # ---- Along a chain of casters ----
 
@@ -218,8 +188,8 @@ class PathEvents:
     ) -> mi.UInt32:
         """The event at a surface of a chain, which scatters light with a specular lobe, or with a
         glossy one."""
-        kind = dr.select(is_rough, mi.UInt32(_GLOSSY), _SPECULAR)
-        return self._of_surface(shape, transmits) * _KINDS + kind
+        kind = dr.select(is_rough, mi.UInt32(GLOSSY), SPECULAR)
+        return self._of_surface(shape, transmits) * KINDS + kind
 
     def at_end(
         self,
@@ -236,16 +206,16 @@ class PathEvents:
         Args:
             chain: The event at each surface, and whether there is one.
         """
-        states = vertex.path.events
-        if self._reads:
-            words = self._words(self._steps, states, self._column(vertex, wo))
-            divides = active & self._divides(words)
-            states = _states(words, self._chosen(vertex, wo, bsdf_value, divides))
+        states, tables = vertex.path.events, self._tables
+        if tables.reads:
+            words = tables.words(tables.steps, states, self._column(vertex, wo))
+            divides = active & depends_on_lobe(words)
+            states = states_in(words, self._chosen(vertex, wo, bsdf_value, divides))
             for event, exists in chain:
-                words = self._words(self._steps, states, event // _KINDS)
-                behind = _states(words, [event % _KINDS])
+                words = tables.words(tables.steps, states, event // KINDS)
+                behind = states_in(words, [event % KINDS])
                 states = [dr.select(exists, new, old) for new, old in zip(behind, states)]
-        return self._ended(states, _looked_up(self._light_class, emitter))
+        return tables.ended(states, _looked_up(self._light_class, emitter))
 
     # ---- Lobes ----
 
@@ -261,7 +231,7 @@ class PathEvents:
         """The share of diffuse lobes in the value ``whole`` of the BSDF, for each colour. ``known``
         is the value of these lobes, if it is known."""
         if not self._mixes:
-            return dr.select(self._kind(vertex.bsdf) == _DIFFUSE, mi.Float(1), 0)
+            return dr.select(self._kind(vertex.bsdf) == DIFFUSE, mi.Float(1), 0)
         # Where light disperses, values are of the hero alone
         whole = None if self._disperses else whole
         weight = self._weight(vertex)
@@ -276,16 +246,16 @@ class PathEvents:
             return [self._kind(vertex.bsdf)]
         number = _hashed(vertex.si.p, wo)
         return [
-            dr.select(number < part, mi.UInt32(_DIFFUSE), _GLOSSY)
+            dr.select(number < part, mi.UInt32(DIFFUSE), GLOSSY)
             for part in self.share(vertex, wo, whole, active, known)
         ]
 
     def _kind(self, bsdf: mi.BSDFPtr) -> mi.UInt32:
         """The kind of the smooth lobes of BSDFs that have only one."""
         if not self._sees_lobes:
-            return mi.UInt32(_DIFFUSE)
+            return mi.UInt32(DIFFUSE)
         is_glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
-        return dr.select(is_glossy, mi.UInt32(_GLOSSY), _DIFFUSE)
+        return dr.select(is_glossy, mi.UInt32(GLOSSY), DIFFUSE)
 
     def _weight(self, vertex: Vertex) -> mi.Float | None:
         if self._undivided is None:
@@ -309,11 +279,11 @@ class PathEvents:
         """The states behind a vertex, for the lobe that ``bs`` is from."""
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        column = dr.select(is_straight, mi.UInt32(_PASSES), self._column(vertex, wo))
-        words = self._words(table, vertex.path.events, column)
-        divides = active & ~is_delta & self._divides(words)
+        column = dr.select(is_straight, mi.UInt32(PASSES), self._column(vertex, wo))
+        words = self._tables.words(table, vertex.path.events, column)
+        divides = active & ~is_delta & depends_on_lobe(words)
         kinds = self._chosen(vertex, wo, whole, divides, known)
-        return _states(words, [dr.select(is_delta, mi.UInt32(_SPECULAR), k) for k in kinds])
+        return states_in(words, [dr.select(is_delta, mi.UInt32(SPECULAR), k) for k in kinds])
 
     def _column(self, vertex: Vertex, wo: mi.Vector3f) -> mi.UInt32:
         """What happens at a vertex that scatters light between ``si.wi`` and ``wo``."""
@@ -321,62 +291,12 @@ class PathEvents:
         transmits = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
         column = self._of_surface(si.shape, transmits)
         if vertex.medium is not None:
-            column = dr.select(vertex.medium.scatters, mi.UInt32(_SCATTERS), column)
+            column = dr.select(vertex.medium.scatters, mi.UInt32(SCATTERS), column)
         return column
 
     def _of_surface(self, shape: mi.ShapePtr, transmits: mi.Bool) -> mi.UInt32:
-        column = dr.select(transmits, mi.UInt32(_TRANSMITS), 0)
-        return column + _COLUMNS * _looked_up(self._surface_class, shape)
-
-    def _words(
-        self, table: mi.UInt32, states: list[mi.UInt32], column: mi.UInt32
-    ) -> list[mi.UInt32]:
-        """The next state for each kind of lobe, for each of the ``states``."""
-        return [dr.gather(mi.UInt32, table, s * self._columns + column) for s in states]
-
-    def _divides(self, words: list[mi.UInt32]) -> mi.Bool:
-        """Whether the next state depends on whether the lobe is diffuse."""
-        mask = (1 << _STATE_BITS) - 1
-        return any_of(((word ^ (word >> _STATE_BITS)) & mask) != 0 for word in words)
-
-    def _met(self, states: list[mi.UInt32], others: list[mi.UInt32]) -> list[mi.UInt32]:
-        """The cells of paths that are joined from two subpaths."""
-        return [
-            dr.gather(mi.UInt32, self._pairs, state * self._backs + other)
-            for state, other in zip(states, others)
-        ]
-
-    def _ended(self, states: list[mi.UInt32], light: mi.UInt32) -> list[mi.UInt32]:
-        """The cells of paths that end at a light."""
-        return [dr.gather(mi.UInt32, self._ends, s * self._lights + light) for s in states]
-
-
-def any_of(masks: Iterable[mi.Bool]) -> mi.Bool:
-    """Whether any of the masks is true."""
-    return functools.reduce(operator.or_, masks)
-
-
-def _states(words: list[mi.UInt32], kinds: list[mi.UInt32]) -> list[mi.UInt32]:
-    """The states in words, for the kind of lobe of each colour. All colours can share a kind."""
-    kinds = kinds * len(words) if len(kinds) < len(words) else kinds
-    mask = (1 << _STATE_BITS) - 1
-    return [(word >> (kind * _STATE_BITS)) & mask for word, kind in zip(words, kinds)]
-
-
-def _by_kind(steps: np.ndarray) -> np.ndarray:
-    """The table of an automaton, shape [states, symbols], as [states, columns, kinds]."""
-    steps = steps.reshape(len(steps), -1, PER_CLASS)
-    columns = [steps[..., side : side + _KINDS] for side in (0, _KINDS)]
-    columns += [steps[..., [symbol] * _KINDS] for symbol in (VOLUME, STRAIGHT)]
-    return np.stack(columns, axis=2).reshape(len(steps), -1, _KINDS)
-
-
-def _packed(parts: np.ndarray, bits: int) -> mi.UInt32:
-    """Words with one number of each of the ``parts``."""
-    words = np.zeros(parts.shape[1:], np.uint32)
-    for index, part in enumerate(parts):
-        words |= part.astype(np.uint32) << np.uint32(index * bits)
-    return from_numpy(mi.UInt32, words)
+        column = dr.select(transmits, mi.UInt32(TRANSMITS), 0)
+        return column + COLUMNS * _looked_up(self._surface_class, shape)
 
 
 def _reversed(vertex: Vertex, to_camera: mi.Vector3f) -> Vertex:

@@ -24,7 +24,7 @@ from .connection import Connection, Connector, can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .free_flight import Distances
 from .heroes import Heroes
-from .media import NoMedia
+from .no_media import NoMedia
 from .observer import Observer
 from .path_channels import PathChannels
 from .path_decisions import (

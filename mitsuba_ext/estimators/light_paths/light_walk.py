@@ -16,7 +16,7 @@ from ...transport.estimator import CameraRays
 from ...transport.free_flight import Distances
 from ...transport.frozen import frozen
 from ...transport.heroes import Heroes
-from ...transport.media import NoMedia
+from ...transport.no_media import NoMedia
 from ...transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ...transport.path_channels import PathChannels
 from ...transport.path_decisions import Roulette, SceneQuery

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...scene.regions.nested_regions import NestedRegions
 from ...scene.regions.surface_voxels import lit_normal
-from ...transport.path_decisions import MixedScattering
+from ...transport.mixed_scattering import MixedScattering
 from .focal_density import FocalDensity
 
 

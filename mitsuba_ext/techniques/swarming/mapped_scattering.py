@@ -12,7 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.path_decisions import MixedScattering, Scattering
+from ...transport.mixed_scattering import MixedScattering
+from ...transport.path_decisions import Scattering
 from .cells import CellDensities, Cells
 
 #: The share of the directions that maps choose.

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.planning import verdicts
-from mitsuba_ext.rendering import device
-from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering import device, passes
 from tests.support.clock import PassClock
 from tests.support.constant_renders import HEIGHT, WIDTH, TwoStages, small_scene
 
@@ -24,7 +23,7 @@ def scene(variant: str) -> mi.Scene:
 def passes_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """At most 64 samples per pixel and pass, in whole warps."""
     gpu = device.Device(True, 64 * WIDTH * HEIGHT * 128)
-    monkeypatch.setattr(rendering, "device_of", lambda kind: gpu)
+    monkeypatch.setattr(passes, "device_of", lambda kind: gpu)
 
 
 @pytest.mark.parametrize("sampler", ["independent", "multijitter"])
