@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -42,9 +43,24 @@ PRECISION = {
 }
 
 
-def _scene(name: str) -> mi.Scene:
-    """With a box filter, so that pixels are independent of each other."""
+@functools.lru_cache(maxsize=1)
+def _scene(name: str, variant: str) -> mi.Scene:
+    """With a box filter, so that pixels are independent of each other. To load rooms takes longer
+    than to render it, so that the scene is kept until another one is needed."""
     return load(name, width=WIDTH, height=HEIGHT, rfilter="box")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_scene_is_kept_for_other_modules() -> Iterator[None]:
+    yield
+    _scene.cache_clear()
+
+
+def _quick(column: str) -> list:
+    """Parameters, one scene after the other. The small cornell_box is last: later tests have it in
+    their kernels."""
+    cases = [case for case in pairs(column) if case.values[-1] not in FOLLOWERS]
+    return sorted(cases, key=lambda case: case.values[0], reverse=True)
 
 
 # ---- The mean: other random numbers, other seeds ----
@@ -55,7 +71,7 @@ def _images_of_path(scene: str, variant: str, seeds: int) -> np.ndarray:
     """Twice the usual samples, divided between ``seeds`` seeds."""
     max_depth, spp = SCENES[scene]
     integrator = REFERENCE.make(max_depth)
-    return batches(_scene(scene), integrator, 2 * spp // seeds, REFERENCE_SEEDS[:seeds])
+    return batches(_scene(scene, variant), integrator, 2 * spp // seeds, REFERENCE_SEEDS[:seeds])
 
 
 def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 0) -> None:
@@ -68,25 +84,20 @@ def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 
         seeds, test = MANY_SEEDS, assert_same_mean
         # Colours of single wavelengths are outside of the gamut
         tolerance = 9.0 if variant == "llvm_ad_spectral" else 0.0
-    images = batches(_scene(scene), technique.make(max_depth), spp // seeds, SEEDS[:seeds])
+    kept = _scene(scene, variant)
+    images = batches(kept, technique.make(max_depth), spp // seeds, SEEDS[:seeds])
     precision = PRECISION[scene][0] * (2 if "law" in technique.parameters else 1)
     test(images, _images_of_path(scene, variant, seeds), precision, tolerance=tolerance)
 
 
-@pytest.mark.parametrize(
-    ("scene", "name"), [case for case in pairs("scenes") if case.values[-1] not in FOLLOWERS]
-)
+@pytest.mark.parametrize(("scene", "name"), _quick("scenes"))
 def test_mean_agrees_with_path(scene: str, name: str) -> None:
     """This includes grids that are much too coarse or much too fine, the law of the paper,
     rejection that ignores what was learned, and other choices of lights."""
     _check_mean(scene, name)
 
 
-@pytest.mark.parametrize(
-    ("variant", "name"),
-    [case for case in pairs("variants") if case.values[-1] not in FOLLOWERS],
-    indirect=["variant"],
-)
+@pytest.mark.parametrize(("variant", "name"), _quick("variants"), indirect=["variant"])
 def test_mean_agrees_with_path_in_variant(variant: str, name: str) -> None:
     _check_mean("cornell_box", name, variant)
 
@@ -94,7 +105,8 @@ def test_mean_agrees_with_path_in_variant(variant: str, name: str) -> None:
 @functools.cache
 def _means_of_path(scene: str) -> np.ndarray:
     max_depth, spp = SCENES[scene]
-    return batches(_scene(scene), REFERENCE.make(max_depth), spp // 2, REFERENCE_SEEDS)
+    kept = _scene(scene, "llvm_ad_rgb")
+    return batches(kept, REFERENCE.make(max_depth), spp // 2, REFERENCE_SEEDS)
 
 
 @pytest.mark.slow
@@ -106,7 +118,8 @@ def _means_of_path(scene: str) -> np.ndarray:
 def test_mean_agrees_with_path_over_many_seeds(scene: str, name: str) -> None:
     max_depth, spp = SCENES[scene]
     technique = TECHNIQUES[name]
-    images = batches(_scene(scene), technique.make(max_depth), spp // 2, SEEDS)
+    kept = _scene(scene, "llvm_ad_rgb")
+    images = batches(kept, technique.make(max_depth), spp // 2, SEEDS)
     # The paper's law is noisy, and so is a small probability for all
     factor = {"law": 2.5, "floor": 1.5}
     factors = [factor[key] for key in factor if key in technique.parameters]

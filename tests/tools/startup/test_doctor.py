@@ -21,8 +21,7 @@ def test_integrators_that_wrap_others_are_tried_around_one_of_ours():
             continue
         label, integrator = doctor._make(name)
         wraps = name in (
-            "adaptive", "control_variate", "ecoc_dof", "variance", "reweighted_lens",
-            "reweighted_time",
+            "adaptive", "ecoc_dof", "variance", "reweighted_lens", "reweighted_time",
         )  # fmt: skip
         assert label == (f"{name} around composed_path" if wraps else name)
         assert integrator.name == name

@@ -7,12 +7,16 @@ import os
 import subprocess
 import sys
 
+import mitsuba as mi
 import pytest
 
 from mitsuba_ext.startup import plugin_folders, runtime
 from tests.support.paths import ROOT
 
 LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith("llvm")]
+
+#: Kernels that compile quickly
+QUICK = "import tests.support.quick_kernels"
 
 #: Some integrators have no depth of their own: they nest another one.
 LOAD_ALL = """
@@ -39,14 +43,15 @@ def load_all():
 
 def _run(code: str) -> str:
     result = subprocess.run(
-        [sys.executable, "-c", LOAD_ALL + code], capture_output=True, text=True, timeout=120
-    )
+        [sys.executable, "-c", LOAD_ALL + code], cwd=ROOT, capture_output=True, text=True,
+        timeout=120,
+    )  # fmt: skip
     assert result.returncode == 0, result.stderr
     return result.stdout
 
 
 def test_an_integrator_works_in_a_variant_that_is_selected_again() -> None:
-    _run("""
+    _run(QUICK + """
 import mitsuba_ext, drjit as dr, mitsuba as mi
 for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     mi.set_variant(variant)
@@ -103,7 +108,7 @@ def test_the_import_may_come_before_or_after_the_variant(code):
 
 
 def test_plugins_work_in_every_variant_in_turn_and_render_there():
-    _run(f"""
+    _run(f"""{QUICK}
 import mitsuba_ext, mitsuba as mi
 from mitsuba_ext.rendering.request import Request
 kept = {{}}
@@ -155,27 +160,24 @@ for name in {names!r}:
     assert all(supported in output for supported in runtime.SUPPORTED_VARIANTS)
 
 
+@pytest.mark.usefixtures("variant")
 def test_a_scene_names_every_parameter_in_xml():
-    _run("""
-import mitsuba_ext, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-common = '''<integer name="pilot_spp" value="2"/> <integer name="max_depth" value="-1"/>
-    <integer name="rr_depth" value="9"/> <boolean name="hide_emitters" value="true"/>
-    <float name="timeout" value="5"/> <string name="aovs" value="d:depth"/>'''
-roulette = '''<string name="law" value="affine"/> <float name="slope" value="4"/>
-    <integer name="refine" value="0"/> <float name="max_memory" value="8"/>
-    <integer name="grid" value="7"/> <float name="floor" value="0.5"/>'''
-composed = (
-    f'{common} <sampler name="shadow_test" type="visibility_roulette">{roulette}</sampler>'
-)
-neepp = f'''{common} {roulette} <boolean name="rejection" value="true"/>
-    <string name="light_sampling" value="uniform"/>'''
-for name, parameters in (("neepp", neepp), ("composed_path", composed)):
-    integrator = mi.load_string(
-        f'<scene version="3.0.0"><integrator type="{name}">{parameters}</integrator></scene>'
-    ).integrator()
-    for text in ("law = affine", "slope = 4.0", "refine = 0", "max_memory = 8.0", "grid = 7",
-                 "pilot_spp = 2", "floor = 0.5", "max_depth = -1", "rr_depth = 9",
-                 "hide_emitters = True", "timeout = 5.0", "aovs = d"):
-        assert text in str(integrator), (text, str(integrator))
-""")
+    common = '''<integer name="pilot_spp" value="2"/> <integer name="max_depth" value="-1"/>
+        <integer name="rr_depth" value="9"/> <boolean name="hide_emitters" value="true"/>
+        <float name="timeout" value="5"/> <string name="aovs" value="d:depth"/>'''
+    roulette = '''<string name="law" value="affine"/> <float name="slope" value="4"/>
+        <integer name="refine" value="0"/> <float name="max_memory" value="8"/>
+        <integer name="grid" value="7"/> <float name="floor" value="0.5"/>'''
+    composed = (
+        f'{common} <sampler name="shadow_test" type="visibility_roulette">{roulette}</sampler>'
+    )
+    neepp = f'''{common} {roulette} <boolean name="rejection" value="true"/>
+        <string name="light_sampling" value="uniform"/>'''
+    for name, parameters in (("neepp", neepp), ("composed_path", composed)):
+        integrator = mi.load_string(
+            f'<scene version="3.0.0"><integrator type="{name}">{parameters}</integrator></scene>'
+        ).integrator()
+        for text in ("law = affine", "slope = 4.0", "refine = 0", "max_memory = 8.0", "grid = 7",
+                     "pilot_spp = 2", "floor = 0.5", "max_depth = -1", "rr_depth = 9",
+                     "hide_emitters = True", "timeout = 5.0", "aovs = d"):  # fmt: skip
+            assert text in str(integrator), (text, str(integrator))
