@@ -291,7 +291,7 @@ class ComposedPRB(common.RBIntegrator):
         key = SceneMark(scene).index, sensor.ptr, film_extent(sensor.film()), *sorted(optimized)
         view = self._views.pop(key, None) or PixelSensitivity()
         if view.is_due():
-            walk = self._for_gradients.remembered(scene)
+            walk = self._for_gradients.remembered(scene, sensor)
             walk = replace(walk, program=Sensitivity(Optimized(scene)))
             with dr.suspend_grad():
                 # Not the random numbers of the pass for gradients

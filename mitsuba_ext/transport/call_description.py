@@ -35,11 +35,12 @@ def address(thing: mi.Object) -> int:
 def sensor_name(sensor: mi.Sensor) -> Any:
     """What kernels depend on besides the parameters of a sensor. Perspective cameras with equal
     films share recordings, because an optimization may have one camera for each of a hundred
-    photographs. Other sensors are named by their address."""
+    photographs. Other sensors are named by their address, and so are cameras with stratified
+    samplers, whose options nothing reports."""
     film = sensor.film()
-    kinds = sensor.class_name(), film.class_name()
+    kinds = sensor.class_name(), film.class_name(), sensor.sampler().class_name()
     if (
-        kinds != ("PerspectiveCamera", "HDRFilm")
+        kinds != ("PerspectiveCamera", "HDRFilm", "IndependentSampler")
         or sensor.get_medium() is not None
         or film.rfilter().class_name() not in _FILTERS
     ):
@@ -148,7 +149,10 @@ class CallDescription:
         if thing is self._scene:
             return "scene"
         if isinstance(thing, mi.Sampler):
-            return type(thing), thing.class_name(), thing.wavefront_size()
+            # Kernels contain the number of strata
+            is_stratified = thing.class_name() != "IndependentSampler"
+            count = thing.sample_count() if is_stratified else None
+            return type(thing), thing.class_name(), thing.wavefront_size(), count
         if isinstance(thing, mi.ImageBlock):
             return (
                 type(thing), tuple(thing.size()), tuple(thing.offset()), thing.channel_count(),
