@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,8 +14,9 @@ from .camera import PixelLanes, film_extent
 from .filter_weights import mean_weights
 from .gradient_pass import GradientSamples
 
-#: The share of the samples that is the same for all pixels on which the loss depends: no pixel has
-#: more than twice its variance with even samples.
+#: The share of the samples that is the same for all pixels on which the loss depends. If each of
+#: these pixels is certain to be sampled (from three samples per pixel on), none has more than twice
+#: its variance with even samples, except for rounding to whole groups.
 _EVEN = 0.5
 
 
@@ -27,8 +30,9 @@ def loss_samples(
     samples that its pixel has, or is expected to have, so that the expected gradient does not
     change.
 
-    A pixel gets its samples in groups of ``spp``, or half as many if these are even, too: so each
-    pixel that has an effect gets a group.
+    A pixel gets its samples in groups of at most half of ``spp``, so that each pixel that has an
+    effect gets a group. With one or two samples per pixel, a group is all of them, and some pixels
+    get none.
 
     Parameters:
         sensor: The sensor, whose film is prepared.
@@ -41,7 +45,7 @@ def loss_samples(
     film = sensor.film()
     share = _shares(film, grad_in, sensitivity)
     # Even groups hold whole pairs (``mirrored_directions.py``)
-    size = spp // 2 if spp % 4 == 0 else spp
+    size = spp // 2 if spp % 4 == 0 else math.gcd(spp, 2)
     number = share.size * spp // size
     places = (np.arange(number) + np.random.default_rng(seed).random()) / number
     pixels = np.searchsorted(np.cumsum(share), places * share.sum(), side="right")

@@ -15,7 +15,7 @@ import pytest
 from mitsuba_ext.rendering.render import Job
 from mitsuba_ext.transport import call_description, frozen
 from mitsuba_ext.transport.walk import Walk
-from tests.support.stage import area, lookat, sensor, stage
+from tests.support.stage import area, film, lookat, sensor, stage
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -289,6 +289,42 @@ def test_perspective_cameras_with_equal_films_share_recordings(name: str) -> Non
             again = mi.render(scene, sensor=camera, integrator=integrator, seed=1, spp=8)
         _assert_same(found, np.array(again))
     assert counts[0] == counts[1] < counts[2]
+
+
+def test_recordings_know_all_that_cameras_differ_in() -> None:
+    """Cameras take turns, one of which changes between its renders."""
+    scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 2})
+    gaussian = {"type": "gaussian", "stddev": 0.4}
+    views = [
+        {}, {"sampler": "stratified"},
+        {"fov": 30, "near_clip": 3.0, "far_clip": 9.0, "principal_point_offset_x": 0.2,
+         "shutter_close": 1.0, "to_world": lookat([2, -3, 1], [0, 0, 0.6], [0, 0, 1]),
+         "film": film(24, 20, crop_width=16, crop_height=16, crop_offset_x=3, rfilter=gaussian)},
+        _THIN_LENS,
+    ]  # fmt: skip
+    views = [sensor(**view) for view in views]
+    views.append({**views[1], "sampler": {"type": "stratified", "jitter": False}})
+    cameras = [scene.sensors()[0], *map(mi.load_dict, views)]
+    for x_fov in (45.0, 60.0):
+        parameters = mi.traverse(cameras[1])
+        parameters["x_fov"] = x_fov
+        parameters.update()
+        for camera in cameras:
+            images = []
+            for flag in (True, False):
+                with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, flag):
+                    images.append(
+                        mi.render(scene, sensor=camera, integrator=integrator, seed=1, spp=9)
+                    )
+            _assert_same(*map(np.array, images))
+
+
+def test_recordings_know_the_number_of_strata() -> None:
+    """The last pass of four has as many samples as a render with a quarter of the samples."""
+    scene = _scene(camera=sensor(sampler="stratified", film=film(8, 8)))
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2, "samples_per_pass": 4})
+    for spp in (4, 16):
+        _assert_same(_image(scene, integrator, 1, spp), _traced(scene, integrator, 1, spp))
 
 
 def test_scenes_that_share_their_sensor_are_two() -> None:
