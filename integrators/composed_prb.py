@@ -212,7 +212,7 @@ class ComposedPRB(common.RBIntegrator):
 
     @property
     def gradient_statistics(self):
-        """Those of the samples from which the passes for gradients have learned."""
+        """Statistics of the samples from which the passes for gradients have learned."""
         return self._sensitive.statistics
 
     def to_string(self) -> str:
@@ -288,7 +288,9 @@ class ComposedPRB(common.RBIntegrator):
 
     def _view(self, scene, optimized, sensor, seed, spp) -> PixelSensitivity:
         """Where in the image of a sensor derivatives come from."""
-        key = SceneMark(scene).index, sensor.ptr, film_extent(sensor.film()), *sorted(optimized)
+        film = sensor.film()
+        window = film_extent(film), tuple(film.crop_offset())
+        key = SceneMark(scene).index, sensor.ptr, *window, *sorted(optimized)
         view = self._views.pop(key, None) or PixelSensitivity()
         if view.is_due():
             walk = self._for_gradients.remembered(scene, sensor)

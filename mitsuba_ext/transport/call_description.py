@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..scene.parameter_values import values_of
+
 #: Values that are their own description.
 VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
@@ -54,6 +56,34 @@ def filter_name(rfilter: mi.ReconstructionFilter) -> Any:
     if rfilter.class_name() in _FILTERS:
         return rfilter.class_name(), rfilter.radius()
     return address(rfilter)
+
+
+def literals(value: Any) -> Any:
+    """The numbers of which a kernel consists where it reads ``value``; ``None`` for others."""
+    if dr.depth_v(value) > 1:
+        return tuple(map(literals, value))
+    is_literal = not dr.is_tensor_v(value) and value.state == dr.VarState.Literal
+    return value[0] if is_literal else None
+
+
+def constants(parameters: mi.SceneParameters) -> tuple:
+    """The parameters that are not arrays: kernels contain them, and users may change them."""
+    # The types of most arrays are known without a look at the arrays, which takes longer
+    keys = (
+        key for key, (_, kind, *_) in parameters.properties.items()
+        if kind is None or not dr.is_jit_v(kind)
+    )  # fmt: skip
+    return tuple(
+        (key, value if isinstance(value, VALUES) else str(value))
+        for key, value in values_of(parameters, keys)
+        if not _holds_arrays(value)
+    )
+
+
+def _holds_arrays(value: Any) -> bool:
+    # Transforms of textures are numbers; transforms of cameras and shapes are arrays
+    names = getattr(type(value), "DRJIT_STRUCT", ())
+    return dr.is_jit_v(value) or any(_holds_arrays(getattr(value, name)) for name in names)
 
 
 class CallDescription:

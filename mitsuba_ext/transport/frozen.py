@@ -59,7 +59,15 @@ from ..scene.mark import SceneMark
 from ..scene.parameter_values import values_of
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
-from .call_description import VALUES, CallDescription, UndescribedError, address, sensor_name
+from .call_description import (
+    VALUES,
+    CallDescription,
+    UndescribedError,
+    address,
+    constants,
+    literals,
+    sensor_name,
+)
 
 #: The largest number of scenes whose recordings are kept, and of recordings of each scene.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
@@ -268,8 +276,8 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     ]  # fmt: skip
     name = sensor_name(sensor)
     values = (
-        threads, name, _values(parameters), _values(mi.traverse(sensor)),
-        tuple(map(_literals, hidden)),
+        threads, name, constants(parameters), constants(mi.traverse(sensor)),
+        tuple(map(literals, hidden)),
     )  # fmt: skip
     if isinstance(name, int) and name not in own:
         kept.held[name] = sensor
@@ -295,34 +303,6 @@ def _is_foreign(thing: mi.Object) -> bool:
 
 def _is_raw(node: mi.Object) -> bool:
     return isinstance(node, mi.Texture) and node.class_name() == "RawConstantTexture"
-
-
-def _literals(value: Any) -> Any:
-    """The numbers of which a kernel consists where it reads ``value``; ``None`` for others."""
-    if dr.depth_v(value) > 1:
-        return tuple(map(_literals, value))
-    is_literal = not dr.is_tensor_v(value) and value.state == dr.VarState.Literal
-    return value[0] if is_literal else None
-
-
-def _values(parameters: mi.SceneParameters) -> tuple:
-    """The parameters that are not arrays: kernels contain them, and users may change them."""
-    # The types of most arrays are known without a look at the arrays, which takes longer
-    keys = (
-        key for key, (_, kind, *_) in parameters.properties.items()
-        if kind is None or not dr.is_jit_v(kind)
-    )  # fmt: skip
-    return tuple(
-        (key, value if isinstance(value, VALUES) else str(value))
-        for key, value in values_of(parameters, keys)
-        if not _holds_arrays(value)
-    )
-
-
-def _holds_arrays(value: Any) -> bool:
-    # Transforms of textures are numbers; transforms of cameras and shapes are arrays
-    names = getattr(type(value), "DRJIT_STRUCT", ())
-    return dr.is_jit_v(value) or any(_holds_arrays(getattr(value, name)) for name in names)
 
 
 def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -> Any:
