@@ -37,8 +37,9 @@ def address(thing: mi.Object) -> int:
 def sensor_name(sensor: mi.Sensor) -> Any:
     """What kernels depend on besides the parameters of a sensor. Perspective cameras with equal
     films share recordings, because an optimization may have one camera for each of a hundred
-    photographs. Other sensors are named by their address, and so are cameras with stratified
-    samplers, whose options nothing reports."""
+    photographs. (Dr.Jit still records each of them if the scene has a sensor of its own.) Other
+    sensors are named by their address, and so are cameras with stratified samplers, whose options
+    nothing reports."""
     film = sensor.film()
     kinds = sensor.class_name(), film.class_name(), sensor.sampler().class_name()
     if (
