@@ -110,7 +110,7 @@ class Planner(Schedule):
         self._only_doubles = all(technique.doubles for technique in learning_ones)
         recorded = max((t.bytes_per_sample for t in learning_ones), default=0)
         self._most_lanes = device_of(mi.Float).lanes(SampleBytes(recorded)) if recorded else 0
-        #: For each stage, the weight of its samples relative to the last stage
+        #: For each stage, the weight of its samples relative to the last stage, whatever is learned
         self._weights = [1.0] * len(stages)
         if self._doubles:
             self._weights = stage_weights(stages)
@@ -165,6 +165,7 @@ class Planner(Schedule):
         if not self._is_tried:
             self._is_tried, self._trial = True, None
         self._pilot_count = self._finished_stages + 1
+        del self._weights[self._pilot_count : -1]
 
     def finish(self, statistics: RenderStatistics) -> None:
         """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
@@ -345,5 +346,6 @@ class Planner(Schedule):
         effects = {slot: learner.effect for slot, learner in everyone.items()}
         effects = {slot: effect.as_dict() for slot, effect in effects.items() if effect}
         return Stage(
-            estimator, learned, effects, camera=self.decisions.camera, most_lanes=most
-        )
+            estimator, learned, effects, camera=self.decisions.camera,
+            weight=self._weights[self._finished_stages], most_lanes=most,
+        )  # fmt: skip

@@ -99,7 +99,7 @@ class Passes:
             self._take(stage, sampler, lanes.lanes(self.film))
             return
         self._begin(stage, lanes)
-        weight = 1.0 if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
+        weight = dr.opaque(mi.Float, stage.weight)  # stages of different weights share a kernel
         labelled = put_samples(
             stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
             self.plan.spp, weight, self.block, self.tally, self.masks and self.masks.labels,
@@ -161,7 +161,7 @@ class Passes:
     def _take(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> None:
         """Puts the samples of these lanes into the block."""
         rays = self._rays(stage, sampler, lanes)
-        count = stage.weight if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
+        count = dr.opaque(mi.Float, stage.weight)
         sample = self._sample(stage, sampler, rays, count)
         for splats in sample.splats:
             if self.splats is None:

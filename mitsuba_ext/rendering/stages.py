@@ -28,8 +28,8 @@ class Stage:
         is_scout: Whether it takes one sample per pixel that is not added to the film.
         pixels: Of a scout: the pixel of each sample; ``None`` for one sample of each pixel.
         camera: Chooses points of the aperture, times and wavelengths.
-        weight: The weight of its samples, in units of the weight of a sample of the last stage. It
-            must not depend on any sample.
+        weight: The weight of its samples, in units of the weight of a sample of the last stage that
+            is planned. It must not depend on any sample, nor on what earlier stages have learned.
         most_lanes: Largest number of samples of a pass, since observers record each sample in
             memory; 0 for no limit. A pass still has at least one sample of each pixel. Passes of
             structured samplers ignore it.

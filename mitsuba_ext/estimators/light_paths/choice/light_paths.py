@@ -179,7 +179,7 @@ class LightPathTrial(Trial):
         self.predicted: PredictedErrors | None = None
         self.costs = np.zeros(0)
         self.check: PredictionCheck | None = None
-        self.discards_pilots = False
+        self.discards_pilots: bool | None = None
 
     @property
     def chosen_time(self) -> float:
@@ -231,7 +231,10 @@ class LightPathTrial(Trial):
         self._compare(rival)
         if verdicts.is_beaten(*self._compared):
             return None
-        return LightPathTrial(self._film, self._spp, self._more)
+        larger = LightPathTrial(self._film, self._spp, self._more)
+        # Pilots decide whether there is a larger trial: it must not decide about them
+        larger.discards_pilots = self.discards_pilots
+        return larger
 
     def choose(self, rival: Rival) -> LightPathChoice | None:
         if self._moments is not None:
@@ -257,9 +260,10 @@ class LightPathTrial(Trial):
             times.append(cost(PHOTONS, photons.counts))
         self.costs = np.divide(times, times[0])
         efficiencies, nothing = 1 / (predicted.variances * self.costs), np.ones(len(times))
-        alone, _ = verdicts.best(efficiencies, predicted.uncertainty, 1.0, nothing)
-        # Where ``path`` cannot find some of the light, this is 0
-        self.discards_pilots = bool(predicted.long_run[alone] < verdicts.FAR_LESS)
+        if self.discards_pilots is None:
+            alone, _ = verdicts.best(efficiencies, predicted.uncertainty, 1.0, nothing)
+            # Where ``path`` cannot find some of the light, this is 0
+            self.discards_pilots = bool(predicted.long_run[alone] < verdicts.FAR_LESS)
         guided = np.array([self._of_guides(candidate) for candidate in self.candidates])
         if self._has_photons:
             # Many candidates merge, or are photons, and leave out guides that others keep

@@ -166,13 +166,24 @@ def _planner(**learners: Learner) -> Planner:
     )
 
 
-def test_pilots_weigh_less_whatever_they_find() -> None:
+@pytest.mark.parametrize("ends", [False, True])
+def test_pilots_weigh_less_whatever_they_find(ends: bool) -> None:
     """If bright pilots were more likely to be left out, the image would be too dark."""
     planner = _planner(scattering=_Idle("focal"))
-    stages = [planner.next_stage() for _ in range(4)]
+    stages = [planner.next_stage() for _ in range(2)]
+    if ends:  # a trial has left out all learners
+        planner._pilot_count = 1
+    stages += [planner.next_stage() for _ in range(2)]
     weights = [stage.weight for stage in stages]
-    assert weights == sorted(weights) and weights[0] < 0.8 and weights[-1] == 1
+    assert weights == sorted(weights) and weights[0] < 0.8 and weights[2] < weights[3] == 1
     assert not any(stage.discards_earlier for stage in stages)
+
+
+def test_the_rest_of_a_render_without_time_to_learn_has_the_weight_of_the_last_stage() -> None:
+    planner = _planner(scattering=_Idle("focal"))
+    stages = [planner.next_stage() for _ in range(2)]
+    planner.end_learning()
+    assert stages[1].weight < planner.next_stage().weight == 1
 
 
 def test_a_learner_replaces_others() -> None:
