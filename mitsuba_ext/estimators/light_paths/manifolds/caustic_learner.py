@@ -57,7 +57,6 @@ class CausticLearner(SeedLearner):
         # Odd, so that they do not lie in a few columns of the film
         self._stride = max(_STRIDE, round(pilot_samples / 4 / most)) | 1
         self._is_used = spp * self._pixel_count >= verdicts.least_of_casters(casters)
-        self.discards_pilots = False
         self._effect: Effect | None = None
         self._restart()
 
@@ -76,11 +75,10 @@ class CausticLearner(SeedLearner):
     def learn(self, pilot):
         if not self._is_used:
             return None
-        is_first, self._is_used = self._stride > 1, self._pays(pilot)
+        self._is_used = self._pays(pilot)
         if not self._is_used:
             self._records = []
             return None
-        self.discards_pilots = is_first and self._effect.variance < verdicts.FAR_LESS
         self._stride = 1
         self._restart()
         return super().learn(pilot)
