@@ -101,12 +101,12 @@ class ComposedPath(WalkIntegrator):
          :monosp:`bounded_manifold` is **biased**: it ends the search for a chain after 64 trials,
          so that light that is rarely found makes no bright pixels, and is partly missing. The
          surfaces are meshes, spheres, rectangles, disks and cylinders that have a
-         :monosp:`dielectric`, :monosp:`conductor`, :monosp:`roughdielectric` or
-         :monosp:`roughconductor` without bump, normal or opacity map. The roughness of rough ones
-         has no texture, and is at most 0.1. Other surfaces, instances, and scenes that move or
-         disperse light are left to scattering. Light of points and directions that passes more
-         than two smooth surfaces is missing, as with :monosp:`scattered`. It refuses participating
-         media, and other :monosp:`scattering` than :monosp:`bsdf`. (Default: scattered)
+         :monosp:`dielectric`, :monosp:`conductor` or :monosp:`roughdielectric` without bump, normal
+         or opacity map. The roughness of rough glass has no texture, and is at most 0.1. Other
+         surfaces, instances, and scenes that move or disperse light are left to scattering. Light
+         of points and directions that passes more than two smooth surfaces is missing, as with
+         :monosp:`scattered`. It refuses participating media, and other :monosp:`scattering` than
+         :monosp:`bsdf`. (Default: scattered)
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which random numbers choose the point on the aperture, the time, and the wavelengths of a

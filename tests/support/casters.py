@@ -10,7 +10,6 @@ import numpy as np
 GLASS = {"type": "dielectric", "int_ior": 1.5}
 MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
 ROUGH_GLASS = {"type": "roughdielectric", "int_ior": 1.5, "alpha": 0.1, "distribution": "ggx"}
-ROUGH_METAL = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.1}}
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 
 

@@ -1,5 +1,5 @@
-"""Connections of the vertices of camera paths to lights through glass and metal, smooth or slightly
-rough.
+"""Connections of the vertices of camera paths to lights through smooth glass and metal, and through
+slightly rough glass.
 
 Sources: J. Hanika, M. Droske, L. Fascione, *Manifold Next Event Estimation*, EGSR 2015; T. Zeltner,
 I. Georgiev, W. Jakob, *Specular Manifold Sampling for Rendering High-Frequency Caustics and

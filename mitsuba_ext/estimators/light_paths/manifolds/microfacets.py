@@ -1,7 +1,7 @@
 """Rough casters: a chain with given microfacet normals.
 
-A rough surface scatters light as many small mirrors (or panes) do, whose normals are distributed
-around the shading normal. Where each surface of a chain has a given *offset*, the slope of its
+Rough glass scatters light as many small smooth panes do, whose normals are distributed around the
+shading normal. Where each surface of a chain has a given *offset*, the slope of its
 microfacet in units of the roughness, the chain is as specular as one through smooth surfaces. Its
 light is then divided by the density of the offsets.
 

@@ -58,8 +58,8 @@ class ManifoldCaustics:
 
 
 class Manifold(Technique):
-    """Connects vertices to lights through one or two smooth or slightly rough surfaces, where the
-    scene has such surfaces."""
+    """Connects vertices to lights through one or two surfaces of smooth glass or metal, or slightly
+    rough glass, where the scene has such surfaces."""
 
     name = "manifold"
     slots, words = ("caustics",), {"manifold": {}}
@@ -124,8 +124,8 @@ def no_effect(scene: mi.Scene, max_depth: int = _SHORTEST) -> str:
         return f'"max_depth" is {max_depth}, and such paths have at least {_SHORTEST} segments'
     if not casters_of(scene):
         return (
-            'no mesh, sphere, rectangle, disk or cylinder has a "dielectric" or "conductor" (or a '
-            "rough one with a roughness of at most 0.1) without bump, normal or opacity map"
+            'no mesh, sphere, rectangle, disk or cylinder has a "dielectric", a "conductor" or a '
+            '"roughdielectric" with a roughness of at most 0.1, without bump, normal or opacity map'
         )
     if movers(scene):
         return "things move"
