@@ -32,7 +32,7 @@ CONTENDERS = {
     "bounded": ({"type": "composed_path", "caustics": "bounded_manifold"}, 1.0),
     "vcm": ({"type": "vcm"}, 0.25),
     "auto_path": ({"type": "auto_path"}, 1.0),
-    "scattered": ({"type": "auto_path", "caustics": "scattered"}, 1.0),
+    "automatic": ({"type": "auto_path", "caustics": "automatic"}, 1.0),
 }
 
 

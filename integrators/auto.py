@@ -43,10 +43,9 @@ class Auto(LightPathIntegrator):
     --------------------------------------------
 
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
-    guided directions or focal points, learned lights, connections through smooth glass and mirrors,
-    and maps of times, lens points, wavelengths and distances (:class:`auto_path`); light paths,
-    their number, the number of connections to them, and merging with them (:class:`vcm`; in
-    participating media, also :class:`sppm`).
+    guided directions or focal points, learned lights, and maps of times, lens points, wavelengths
+    and distances (:class:`auto_path`); light paths, their number, the number of connections to
+    them, and merging with them (:class:`vcm`; in participating media, also :class:`sppm`).
 
     .. pluginparameters::
 
@@ -81,16 +80,15 @@ class Auto(LightPathIntegrator):
     predict the variance of each choice: no light paths, or 1/16, 1/4, 1 or 4 of them per camera
     path; 0, 1, 2 or 4 connections from each vertex of a camera path to their vertices; with or
     without merging. Counts of rays predict the time of each choice. The integrator uses the best of
-    these choices if it is better than guided directions or focal points, connections through glass
-    and mirrors, and maps. Focal points, these connections and maps are then dropped. Guided
-    directions that paid before are learned again, from samples with light paths, unless vertices
-    are merged; together with light paths, a guide is expected to keep the square root of its
-    efficiency. The trial has 16384 samples, spread over the film, which are not part of the image
-    (8192 in renders of less than a million samples, 4096 of less than half a million; in
-    participating media, where such a sample takes longer, four million and two million). A trial of
-    4096 samples precedes it, except in media, and replaces it where light paths are worse beyond
-    doubt. If light paths reduce the variance to less than 0.4 of its value, the samples before the
-    trial are left out of the image.
+    these choices if it is better than guided directions or focal points, and maps. Focal points and
+    maps are then dropped. Guided directions that paid before are learned again, from samples with
+    light paths, unless vertices are merged; together with light paths, a guide is expected to keep
+    the square root of its efficiency. The trial has 16384 samples, spread over the film, which are
+    not part of the image (8192 in renders of less than a million samples, 4096 of less than half a
+    million; in participating media, where such a sample takes longer, four million and two
+    million). A trial of 4096 samples precedes it, except in media, and replaces it where light
+    paths are worse beyond doubt. If light paths reduce the variance to less than 0.4 of its value,
+    the samples before the trial are left out of the image.
 
     With fewer than 262144 samples (33554432 on a GPU, which takes more samples in the same time),
     the integrator skips learning and renders as :monosp:`path` does, except that it chooses among
@@ -188,7 +186,7 @@ class Auto(LightPathIntegrator):
 
     def estimators(self, request, spp, learning):
         if learning.trial is None:
-            return self.estimator
+            return self.walk
         estimators = super().estimators(request, spp, learning)
         if not _has_photons(request.scene):
             return estimators

@@ -18,9 +18,8 @@ class AutoPath(WalkIntegrator):
     --------------------------------------------------
 
     A path tracer that chooses its techniques itself: guided directions or focal points, learned
-    lights, connections through smooth glass and mirrors, and maps of the times, lens points,
-    wavelengths and distances in fog with which paths find light. Its first samples test which of
-    them reduce the noise of this scene by more than
+    lights, and maps of the times, lens points, wavelengths and distances in fog with which paths
+    find light. Its first samples test which of them reduce the noise of this scene by more than
     they cost, and it keeps those.
 
     .. pluginparameters::
@@ -50,9 +49,10 @@ class AutoPath(WalkIntegrator):
      * - caustics
        - |string|
        - Whether paths also connect to lights through smooth glass and mirrors, as in
-         :class:`composed_path`: where pilots find that it pays (:monosp:`automatic`), always
-         (:monosp:`manifold`, or :monosp:`bounded_manifold`, which is **biased**), or never
-         (:monosp:`scattered`). Where paths connect, there are no focal points. (Default: automatic)
+         :class:`composed_path`: never (:monosp:`scattered`), always (:monosp:`manifold`, or
+         :monosp:`bounded_manifold`, which is **biased**), or where pilots find that it pays
+         (:monosp:`automatic`, which may choose wrongly). Except with :monosp:`scattered`, focal
+         points are not tried. (Default: scattered)
      * - (Common parameters)
        - |several|
        - The parameters of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout,
@@ -60,7 +60,7 @@ class AutoPath(WalkIntegrator):
 
     **Use it when** you do not know which technique a scene needs, and render 16 or more samples per
     pixel. **Not when** an image has fewer samples (too few to learn from), or when small lamps
-    shine through frosted glass or many pieces of glass (camera paths do not find their light).
+    shine through glass (camera paths do not find their light).
 
     Renders of fewer than 262144 samples (33554432 on a GPU) learn nothing, and choose among several
     lights by a light tree, unless the scene gives a :monosp:`pilot_spp` of 1 or more, or what is
@@ -68,9 +68,9 @@ class AutoPath(WalkIntegrator):
     all samples.
 
     It is :monosp:`composed_path` with :monosp:`directions=guided`, :monosp:`scattering=focal`,
-    :monosp:`next_event=contribution`, :monosp:`caustics=automatic`, and the word :monosp:`swarm` in
-    the slots :monosp:`time`, :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; the
-    pages of :monosp:`guided_directions`, :monosp:`focal_points`, :monosp:`learned_lights` and
+    :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
+    :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; the pages of
+    :monosp:`guided_directions`, :monosp:`focal_points`, :monosp:`learned_lights` and
     :monosp:`swarm_path` describe what is learned, and how. Focal points are used in place of guided
     directions, where they gain more. The maps are used in scenes with an open shutter, a lens or
     fog, and in spectral variants; otherwise they cost nothing. The first two pilots are short.
@@ -103,10 +103,7 @@ class AutoPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        techniques = auto_techniques(self.name)
-        if "caustics" in props:
-            techniques["caustics"] = read_slot(self.name, props, "caustics")
-            if techniques["caustics"] is not None:
-                # These connections know the densities of BSDFs only
-                techniques.pop("scattering", None)
-        self.fill(props, **techniques)
+        techniques, caustics = auto_techniques(self.name), read_slot(self.name, props, "caustics")
+        if caustics is not None:
+            techniques.pop("scattering", None)  # these connections know the densities of BSDFs only
+        self.fill(props, caustics=caustics, **techniques)

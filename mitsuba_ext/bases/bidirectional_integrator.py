@@ -217,10 +217,9 @@ class LightPathEstimators:
             next_event = side.next_event(next_event)
         else:
             next_event = next_event or side.correct
-        decisions = replace(decisions, next_event=next_event)
+        walk = integrator.walk(replace(decisions, next_event=next_event), observer)
         if not are_traced:
-            return integrator.estimator(decisions, observer)
-        walk = integrator.walk(decisions, observer)
+            return walk
         radii = None
         if techniques.merges:
             compares = choice.observer is not None and choice.observer.compares

@@ -94,8 +94,8 @@ LIGHT_CHOICES = {
 #: What ``auto_path`` and ``auto`` learn for camera paths.
 _AUTO = {
     "directions": "guided", "scattering": "focal", "next_event": "contribution",
-    "roulette": "automatic", "caustics": "automatic", "time": "swarm", "aperture": "swarm",
-    "wavelength": "swarm", "distance": "swarm",
+    "roulette": "automatic", "time": "swarm", "aperture": "swarm", "wavelength": "swarm",
+    "distance": "swarm",
 }  # fmt: skip
 
 #: The pilot samples per pixel of what ``auto`` learns: maps alone would ask for more.

@@ -48,11 +48,9 @@ FIRST_MAP_SHARE, FINER_MAP_SHARE = 0.05, 1 / 3
 #: casters. (The trial takes 0.04 s, and the table of a caster takes 0.02 s.)
 LEAST_CAUSTIC_SAMPLES, SAMPLES_PER_CASTER = 1 << 21, 1 << 19
 
-#: The efficiency that the first pilot must predict for connections through casters, and the part of
-#: the predicted efficiency that is left once rare chains are found, relative to light paths. (In
-#: five scenes, pilots predict 0.9 to 3.4 times the efficiency of light paths, and 0.15 to 0.5 times
-#: is measured, without the brightest pixels.)
-CAUSTICS, RARE_CHAINS = 3.0, 1 / 8
+#: The efficiency that the first pilot must predict for connections through casters. (Pilots miss
+#: rare chains: they predict up to ten times the efficiency that is measured.)
+CAUSTICS = 3.0
 
 #: What light paths must gain, besides the time to compile their kernels.
 LIGHT_PATHS = 1.1

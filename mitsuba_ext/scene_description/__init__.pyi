@@ -73,10 +73,9 @@ def auto(
     """Self-configuring integrator (auto).
 
     Begins as path, and measures which techniques are worth their time in this scene: guided
-    directions or focal points, learned lights, connections through smooth glass and mirrors, and
-    maps of times, lens points, wavelengths and distances (auto_path); light paths, their number,
-    the number of connections to them, and merging with them (vcm; in participating media, also
-    sppm).
+    directions or focal points, learned lights, and maps of times, lens points, wavelengths and
+    distances (auto_path); light paths, their number, the number of connections to them, and merging
+    with them (vcm; in participating media, also sppm).
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
@@ -107,7 +106,7 @@ def auto_path(
     keep_learned: bool = False,
     clamp_direct: float = 0,
     clamp_indirect: float = 0,
-    caustics: str = "automatic",
+    caustics: str = "scattered",
     max_depth: int = -1,
     rr_depth: int = 5,
     hide_emitters: bool = False,
@@ -120,9 +119,9 @@ def auto_path(
     """Self-configuring path tracer (auto_path).
 
     A path tracer that chooses its techniques itself: guided directions or focal points, learned
-    lights, connections through smooth glass and mirrors, and maps of the times, lens points,
-    wavelengths and distances in fog with which paths find light. Its first samples test which of
-    them reduce the noise of this scene by more than they cost, and it keeps those.
+    lights, and maps of the times, lens points, wavelengths and distances in fog with which paths
+    find light. Its first samples test which of them reduce the noise of this scene by more than
+    they cost, and it keeps those.
 
     Parameters:
         pilot_spp (int): Number of pilot samples per pixel, from which the integrator learns; at
@@ -134,8 +133,9 @@ def auto_path(
         clamp_direct, clamp_indirect (float): Biased: the largest light of a sample, see
             composed_path. (Default: 0)
         caustics (string): Whether paths also connect to lights through smooth glass and mirrors, as
-            in composed_path: where pilots find that it pays (automatic), always (manifold, or
-            bounded_manifold, which is biased), or never (scattered). (Default: automatic)
+            in composed_path: never (scattered), always (manifold, or bounded_manifold, which is
+            biased), or where pilots find that it pays (automatic, which may choose wrongly).
+            (Default: scattered)
         max_depth (int): Longest path in the image, -1 for no limit. (Default: -1)
         rr_depth (int): Path depth at which Russian roulette on the throughput begins. (Default: 5)
         hide_emitters (bool): Hide directly visible emitters. (Default: false)

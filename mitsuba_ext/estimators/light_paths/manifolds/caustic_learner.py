@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -11,7 +11,7 @@ import mitsuba as mi
 from ....planning import verdicts
 from ....planning.costs import CHAIN_TRIAL, FIRST_CHAIN, SEGMENT, SHADOW
 from ....planning.evidence import PathSums, gain_of
-from ....planning.learner import Learner, Pilot
+from ....planning.learner import Pilot
 from ....planning.pixel_estimates import PixelEstimates, brightness
 from ....planning.prediction import Effect, Prediction
 from ....transport.estimator import Sample
@@ -42,15 +42,14 @@ class CausticLearner(SeedLearner):
         film_size: Width and height of the film in pixels, with its border where that is sampled.
         spp: Samples per pixel of the render.
         pilot_samples: Samples of all pilots together.
-        others: The learners of the slots before.
     """
 
     def __init__(
         self, make: Callable[..., Any], casters: int, film_size: tuple[int, int], spp: int,
-        pilot_samples: int, others: Mapping[str, Learner],
+        pilot_samples: int,
     ) -> None:
         super().__init__(make)
-        self._spp, self._pilot_samples, self._others = spp, pilot_samples, others
+        self._spp, self._pilot_samples = spp, pilot_samples
         self._pixels, self._caustics = PixelEstimates(*film_size), PixelEstimates(*film_size)
         self._pixel_count = film_size[0] * film_size[1]
         most = spp * self._pixel_count / _RENDER_STRIDE
@@ -63,11 +62,6 @@ class CausticLearner(SeedLearner):
     def _restart(self) -> None:
         #: Rays, shadow rays and trials, and the number of all paths of the stage
         self._sums, self._paths, self._rays = PathSums(2), 0, [0, 0]
-
-    @property
-    def replaces(self) -> tuple[str, ...]:
-        # Connections know the densities of BSDFs only
-        return ("scattering",) if self._is_used and self._stride == 1 else ()
 
     def start(self, scene, p, n):
         return self._make(self._map, self._record, self._stride) if self._is_used else None
@@ -97,9 +91,7 @@ class CausticLearner(SeedLearner):
         time = 1 + (FIRST_CHAIN + CHAIN_TRIAL * trials / connected) * self._paths / of_path
         self._effect = Effect(True, max(1 - gain, 1e-3), time)
         known = connected / self._pilot_samples
-        other = self._others.get("scattering")
-        rival = 1.0 if other is None else other.efficiency
-        prediction = Prediction(1 - gain, time * rival, error, known, True)
+        prediction = Prediction(1 - gain, time, error, known, True)
         least = verdicts.CAUSTICS if self._stride > 1 else 1.0
         is_worth = prediction.efficiency >= least and pilot.pays(prediction)
         if not is_worth:
@@ -144,16 +136,6 @@ class CausticLearner(SeedLearner):
     def restore(self, scene, state):
         self._is_used = True
         return super().restore(scene, state)
-
-    @property
-    def efficiency(self) -> float:
-        if self._effect is None or not self._is_used:
-            return 1.0
-        return 1 / (self._effect.variance * self._effect.time)
-
-    @property
-    def growth(self) -> float:
-        return verdicts.RARE_CHAINS if self.efficiency > 1 else 1.0
 
     @property
     def effect(self) -> Effect | None:

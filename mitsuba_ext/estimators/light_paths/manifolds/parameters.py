@@ -147,10 +147,7 @@ class LearnedManifold(Manifold):
     name, words = "learned_manifold", {"automatic": {}}
     #: Where it is not used, samples are those of ``path``
     sample_cost, sample_bytes, bytes_per_sample = 1, 0, SAMPLE_BYTES
-    camera_paths_only, sees_media, finds_all_light, tries = False, True, True, True
-
-    def check_together(self, plugin, slots):
-        """It takes the place of other directions."""
+    sees_media, tries = True, True
 
     def can_learn(self, scene, spp):
         return super().can_learn(scene, spp) and _may_cast(scene)
@@ -164,9 +161,8 @@ class LearnedManifold(Manifold):
             return None
         size = film_extent(setting.sensor.film())
         return CausticLearner(
-            self.maker(setting), len(casters_of(scene)), size, setting.spp, setting.pilot_samples,
-            others,
-        )  # fmt: skip
+            self.maker(setting), len(casters_of(scene)), size, setting.spp, setting.pilot_samples
+        )
 
 
 def _may_cast(scene: mi.Scene) -> bool:

@@ -1,4 +1,4 @@
-"""Connections through casters as a candidate of ``auto_path``."""
+"""Connections through casters where pilots show that they pay."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_short_renders_connect_nothing() -> None:
     learner = LearnedManifold().learner(setting, {})
     assert learner.start(scene, mi.Point3f(), mi.Normal3f()) is None
     assert learner.learn(Pilot(scene, True)) is None and learner.effect is None
-    assert not (str(learner) or learner.state() or learner.replaces)
+    assert not (str(learner) or learner.state())
 
 
 @pytest.mark.slow
@@ -55,7 +55,9 @@ def test_connections_that_pay_are_used_and_change_no_mean(monkeypatch) -> None:
     monkeypatch.setattr(verdicts, "LEAST_CAUSTIC_SAMPLES", 1)
     monkeypatch.setattr(verdicts, "SAMPLES_PER_CASTER", 1)
     scene = _scene(ball=_BALL)
-    integrator = mi.load_dict({"type": "auto_path", "max_depth": 6, "pilot_spp": 8})
+    integrator = mi.load_dict({
+        "type": "auto_path", "caustics": "automatic", "max_depth": 6, "pilot_spp": 8,
+    })  # fmt: skip
     images = [np.array(integrator.render(scene, spp=256, seed=i)).mean() for i in range(24)]
     assert integrator.statistics.effects["caustics"]["is_kept"]
     assert integrator.statistics.effects["caustics"]["variance"] < 0.3
