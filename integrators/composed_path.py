@@ -96,8 +96,9 @@ class ComposedPath(WalkIntegrator):
          :monosp:`manifold`, one vertex of each path is also connected to a light through one
          reflection, or one or two refractions, by Newton's method. Pilots learn where such chains
          begin. A sample takes 3 to 11 times as long as with :monosp:`path`. With
-         :monosp:`automatic`, this is done where pilots find that it pays, in renders of two million
-         samples or more, and in scenes with at most 16 such surfaces and without media.
+         :monosp:`automatic`, this is done where pilots predict that it pays (they may be wrong), in
+         renders of two million samples or more, and in scenes with at most 16 such surfaces and
+         without media.
          :monosp:`bounded_manifold` is **biased**: it ends the search for a chain after 64 trials,
          so that light that is rarely found makes no bright pixels, and is partly missing. The
          surfaces are meshes, spheres, rectangles, disks and cylinders that have a

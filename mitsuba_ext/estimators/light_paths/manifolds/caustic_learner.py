@@ -92,7 +92,7 @@ class CausticLearner(SeedLearner):
         self._effect = Effect(True, max(1 - gain, 1e-3), time)
         known = connected / self._pilot_samples
         prediction = Prediction(1 - gain, time, error, known, True)
-        least = verdicts.CAUSTICS if self._stride > 1 else 1.0
+        least = verdicts.CAUSTICS if self._stride > 1 else verdicts.LATER_CAUSTICS
         is_worth = prediction.efficiency >= least and pilot.pays(prediction)
         if not is_worth:
             self._effect = Effect(False, self._effect.variance, time)
