@@ -49,8 +49,8 @@ FIRST_MAP_SHARE, FINER_MAP_SHARE = 0.05, 1 / 3
 LEAST_CAUSTIC_SAMPLES, SAMPLES_PER_CASTER = 1 << 21, 1 << 19
 
 #: The efficiency that the first pilot must predict for connections through casters, and later ones.
-#: (Pilots miss rare chains, and count rare bright paths that few renders have. Where they predict 91
-#: to 286, 4 to 49 is measured over all pixels; where they predict 9 to 18, 0.2 to 0.4.)
+#: (Pilots miss rare chains, and count rare bright paths that few renders have. Where they predict
+#: 91 to 286, 4 to 49 is measured over all pixels; where they predict 9 to 18, 0.2 to 0.4.)
 CAUSTICS, LATER_CAUSTICS = 30.0, 10.0
 
 #: What light paths must gain, besides the time to compile their kernels.
