@@ -62,7 +62,8 @@ def test_any_two_words_go_together_or_are_refused_in_a_sentence() -> None:
     # In a variant without wavelengths, the maps of these do not go with anything
     left = {key: sentence for key, sentence in refused.items() if "wavelength" not in key}
     # Connections through casters know the densities of BSDFs only
-    for word, another in itertools.product(("focal", "swarm"), ("manifold", "bounded_manifold")):
+    connected = ("automatic", "manifold", "bounded_manifold")
+    for word, another in itertools.product(("focal", "swarm"), connected):
         sentence = left.pop(("scattering", word, "caustics", another))
         assert 'leave "scattering" out' in sentence
     learned = ("visibility", "contribution", "triple_product")
