@@ -56,11 +56,8 @@ def _scene(name: str) -> mi.Scene:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plugin", ["auto_path", "auto"])
-@pytest.mark.parametrize("scene", ["gap", "keyhole", "door_ajar"])
-def test_short_renders_have_the_right_mean(
-    scene: str, plugin: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("scene", ["gap", "keyhole"])
+def test_short_renders_have_the_right_mean(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pilots have an eighth of the 64 samples."""
     monkeypatch.setattr(verdicts, "least_samples", lambda is_gpu: 0)
     # Light paths are tried in such short renders, too
@@ -72,8 +69,10 @@ def test_short_renders_have_the_right_mean(
         integrator = mi.load_dict({"type": name, "max_depth": 5})
         return batches(loaded, integrator, spp, seeds).mean(axis=(1, 2, 3))
 
-    found, expected = means(plugin, 64, range(1, 65)), means("bdpt", 256, range(1001, 1025))
-    error = np.sqrt(sum(x.var(ddof=1) / len(x) for x in (found, expected))) / expected.mean()
-    z = float(z_welch(found, expected))
-    print(f"{found.mean() / expected.mean():.4f} ± {error:.4f}, z = {z:.1f}")
-    assert abs(z) < THRESHOLD and error < 0.02
+    expected = means("bdpt", 256, range(1001, 1017))
+    for plugin in ("auto_path", "auto"):
+        found = means(plugin, 64, range(1, 41))
+        error = np.sqrt(sum(x.var(ddof=1) / len(x) for x in (found, expected))) / expected.mean()
+        z = float(z_welch(found, expected))
+        print(f"{plugin} {found.mean() / expected.mean():.4f} ± {error:.4f}, z = {z:.1f}")
+        assert abs(z) < THRESHOLD and error < 0.02
