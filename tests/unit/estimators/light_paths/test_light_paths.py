@@ -188,7 +188,7 @@ def test_several_connections_are_tried_where_light_paths_are_shared_and_not_merg
 
 
 @pytest.mark.slow
-def test_light_paths_are_chosen_behind_glass_and_merging_where_light_is_seen_through_water() -> None:
+def test_light_paths_pay_behind_glass_and_merging_where_light_is_seen_through_water() -> None:
     """In glass_lamp, where nothing shows the light through glass, merging gains little."""
     integrator = mi.load_dict(
         {"type": "vcm", "max_depth": 6, "light_paths": "auto", "pilot_spp": 16}
