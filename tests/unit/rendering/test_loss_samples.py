@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_ext.rendering.loss_samples import loss_samples
 from mitsuba_ext.rendering.pixel_sensitivity import PixelSensitivity
 from tests.support.stage import area, film, rectangle, rgb, sensor, stage
 
@@ -152,6 +153,21 @@ def test_pixels_that_are_certain_to_be_sampled_have_no_noise_of_their_number_of_
         by.render_backward(scene, parameters, weights, seed=seed, spp=4)
         found = dr.grad(parameters["sky.radiance.value"]).numpy().sum()
         np.testing.assert_allclose(found, derivative.sum(), rtol=1e-4)
+
+
+def test_pixels_that_are_rarely_sampled_count_as_much_on_average() -> None:
+    """With one sample per pixel, some pixels have none in most passes."""
+    view = mi.load_dict(sensor(film=film(8, 6)))
+    view.film().prepare([])
+    derivative, sensitivity = np.ones((6, 8, 3), np.float32), np.ones((6, 8))
+    derivative[0, 0], sensitivity[5] = 40, 0.01
+    weights, passes = np.zeros(48), 300
+    for seed in range(passes):
+        samples = loss_samples(view, 1, mi.TensorXf(derivative), seed, sensitivity)
+        pixels = samples.lanes.lanes(view.film()).pixel.numpy()
+        np.add.at(weights, pixels, samples.weight.numpy() / passes)
+    np.testing.assert_allclose(weights, 1, atol=0.3)
+    assert abs(weights.mean() - 1) < 0.02
 
 
 def test_image_and_gradient_need_numbers_of_their_own() -> None:
